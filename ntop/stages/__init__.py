@@ -1,0 +1,16 @@
+"""The eight stages: number, name, version. Imports nothing heavy, the Snakefile reads it.
+
+`version` is bumped when the *meaning* of a stage's output changes; the workflow then reruns that
+stage and what follows from it, and the command line refuses a mismatch.
+"""
+
+STAGES = (
+    (1, "capture", 1),
+    (2, "mask", 1),
+    (3, "fit", 1),
+    (4, "train", 1),
+    (5, "render", 1),
+    (6, "annotate", 1),
+    (7, "assemble", 1),
+    (8, "evaluate", 1),
+)

@@ -1,0 +1,60 @@
+"""Write a file or a folder so that it is either whole or absent, whatever happens meanwhile."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ntop.conventions import DataError
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path`; it becomes `path` when the block ends without an error.
+
+    Raises:
+        DataError: the folder cannot be made or written to, or the disk is full.
+    """
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise DataError(
+            f"cannot write {path}: {error.strerror or error}; "
+            "check the folder's permissions and the free space, then run the same command again"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write `content` atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def publish_folder(work: Path, target: Path) -> None:
+    """Make the finished folder `work` become `target` in one rename.
+
+    An older `target` is moved aside first and removed last, so that no moment leaves a mixture.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        old = None
+        if target.exists():
+            old = target.with_name(f".{target.name}.{uuid.uuid4().hex}.old")
+            target.rename(old)
+        work.rename(target)
+        if old is not None:
+            shutil.rmtree(old)
+    except OSError as error:
+        raise DataError(
+            f"cannot publish {work} as {target}: {error.strerror or error}; "
+            "check the folder's permissions, then run the same command again"
+        ) from error

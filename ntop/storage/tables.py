@@ -1,0 +1,53 @@
+"""Parquet tables: explicit schema, sorted rows, checked on reading."""
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ntop.conventions import DataError
+from ntop.storage.atomic import atomic_path
+
+Row = dict[str, Any]
+
+
+def write_table(rows: list[Row], *, schema: pa.Schema, path: Path) -> None:
+    """Write rows, sorted by the schema's leading key columns, as one Parquet file.
+
+    Raises:
+        DataError: a row misses a column, has an unknown one, or a value of the wrong type.
+    """
+    names = set(schema.names)
+    for index, row in enumerate(rows):
+        if set(row) != names:
+            missing, unknown = sorted(names - set(row)), sorted(set(row) - names)
+            raise DataError(f"{path} row {index}: missing columns {missing}, unknown {unknown}")
+    keys = [n for n in ("source", "actor", "action", "rig", "frame", "view") if n in names]
+    ordered = sorted(rows, key=lambda row: tuple(row[key] for key in keys))
+    try:
+        table = pa.Table.from_pylist(ordered, schema=schema)
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        raise DataError(f"{path}: a value does not fit its column: {error}") from error
+    with atomic_path(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd")
+
+
+def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
+    """Rows of a table, after a check of its schema.
+
+    Raises:
+        DataError: the file is missing, truncated, or has other columns than expected.
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise DataError(
+            f"cannot read table {path}: {error}; delete it and run the workflow again"
+        ) from error
+    if table.schema.names != schema.names:
+        raise DataError(
+            f"{path}: columns {table.schema.names}, expected {schema.names}; "
+            "it was written by another version: rerun the stage that makes it"
+        )
+    return table.cast(schema).to_pylist()

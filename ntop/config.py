@@ -1,0 +1,258 @@
+"""What a run is about: one frozen section per stage, unknown keys are errors, units in the names.
+
+The sections hold science only (what, never how): threads, memory and folders belong to profiles and
+rules. The Snakefile validates the merged YAML with `read_config` and hands every stage its own
+section as JSON (`stage_section`), so that a stage can be run alone and a changed value reruns
+exactly that stage and what follows from it.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ntop.conventions import ConfigError
+
+# keys of earlier versions -> what to write instead
+RETIRED_KEYS = {
+    "heights_above_pelvis_m": "use render.rigs.<name>.height_above_pelvis_m",
+    "frame_step": "use the column `step` of the sequences table",
+    "splits": "use the column `split` of the actors table",
+}
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, and a misspelt key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Sequence(Section):
+    """One row of the sequences table: a run of frames of one actor, and what it is used for."""
+
+    source: str
+    actor: str
+    action: str
+    first: int = Field(ge=0, description="First frame, 0-based.")
+    last: int = Field(ge=0, description="Last frame, included.")
+    step: int = Field(default=1, ge=1)
+    use: Literal["train", "render"]
+    motion: str = Field(
+        default="",
+        description="Empty: the recorded poses of `action`. Else `authored:<name>` or "
+        "`deepmimic:<name>`, sampled at 30 frames per second.",
+    )
+    truth: bool = Field(
+        default=False, description="Studio only: ray-cast the true fisheye views of these sets."
+    )
+
+    @property
+    def frames(self) -> range:
+        """The frames of the sequence."""
+        return range(self.first, self.last + 1, self.step)
+
+
+class Actor(Section):
+    """One row of the actors table."""
+
+    source: str
+    actor: str
+    split: Literal["train", "val"]
+    gender: Literal["f", "m", "n"] = "n"
+
+
+Given = Literal["masks", "keypoints2d", "bodies"]
+
+
+class SourceSection(Section):
+    """What every source declares, whatever its reader."""
+
+    provides: tuple[Given, ...] = Field(
+        default=(), description="What comes with the source, so that no stage computes it."
+    )
+    held_out_views: tuple[str, ...] = Field(
+        default=(), description="Cameras of which no pixel or mask reaches training."
+    )
+    overrides: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Stage section values that differ for this source."
+    )
+
+
+class QualisysTrial(Section):
+    """One trial of a Qualisys recording."""
+
+    videos: str = Field(description="Folder of the trial's videos, below the package folder.")
+
+
+class QualisysSource(SourceSection):
+    """A recording calibrated with Qualisys Track Manager, shipped in a published package."""
+
+    reader: Literal["qualisys"]
+    package: str
+    calibration: str = Field(description="Path of the .qca.txt file below the package folder.")
+    views: tuple[str, ...]
+    trials: dict[str, QualisysTrial] = Field(description="Action -> trial.")
+    letterbox_offset_px: float = Field(
+        default=7.06, description="Vertical offset of a letter-boxed copy of the calibrated image."
+    )
+    pose2sim_compat: bool = Field(
+        default=False, description="Divide the distortion by 64, as Pose2Sim does."
+    )
+
+
+class StudioSource(SourceSection):
+    """A synthetic capture with known truth."""
+
+    reader: Literal["studio"]
+    num_cameras: int = Field(default=8, ge=2)
+    image_size_px: int = Field(default=512, ge=32)
+    camera_radius_m: float = Field(default=2.7, gt=1)
+    supersampling: int = Field(default=3, ge=1)
+    truth_supersampling: int = Field(default=4, ge=1)
+    seed: int = 0
+    light_to_ambient: float = Field(default=3.0, ge=0)
+    pose_noise_mm: float = Field(default=0.0, ge=0)
+    calibration_noise_px: float = Field(default=0.0, ge=0)
+    mask_growth_px: int = Field(default=0, description="Dilation (>0) or erosion (<0) of masks.")
+    keypoint_noise_px: float = Field(default=0.0, ge=0)
+
+
+Source = Annotated[QualisysSource | StudioSource, Field(discriminator="reader")]
+
+
+class CaptureConfig(Section):
+    """Section `capture`, completed by the workflow with the actor's source and sequences."""
+
+    source_section: Source
+    sequences: tuple[Sequence, ...]
+    rigs: dict[str, "RigConfig"] = Field(default_factory=dict, description="For studio truth.")
+    image: "ImageConfig"
+
+
+class MaskConfig(Section):
+    """Section `mask`."""
+
+    method: Literal["mediapipe", "background"] = "mediapipe"
+    provides: tuple[Given, ...] = ()
+    overrides: str = Field(default="", description="Folder of hand-corrected masks; empty: none.")
+
+
+class FitConfig(Section):
+    """Section `fit`."""
+
+    held_out_views: tuple[str, ...] = ()
+    refine_cameras: bool = True
+
+
+class TrainConfig(Section):
+    """Section `train`."""
+
+    held_out_views: tuple[str, ...] = ()
+    steps: int = Field(default=1500, ge=1)
+    rays_per_batch: int = Field(default=4096, ge=64)
+    seed: int = 0
+
+
+class RigConfig(Section):
+    """One setting of the nine-camera rig (paper section 3.2)."""
+
+    height_above_pelvis_m: float = Field(gt=0)
+    ring_radius_m: float = Field(ge=0)
+
+
+class ImageConfig(Section):
+    """Size and lens of the virtual fisheye images."""
+
+    width_px: int = Field(default=1000, ge=16)
+    height_px: int = Field(default=1000, ge=16)
+    focal_px: float | None = Field(
+        default=None, gt=0, description="Pixels per radian; default min(width, height) / pi."
+    )
+    max_theta_deg: float = Field(default=90.0, gt=0, lt=180)
+
+
+class RenderConfig(Section):
+    """Section `render`."""
+
+    rigs: dict[str, RigConfig]
+    image: ImageConfig = ImageConfig()
+    sets_per_shard: int = Field(default=10, ge=1)
+    seed: int = 0
+    paper_compat: bool = False
+
+
+class AnnotateConfig(Section):
+    """Section `annotate`."""
+
+
+class AssembleConfig(Section):
+    """Section `assemble`, completed by the workflow with the actors and their splits."""
+
+    dataset: str
+    actors: tuple[Actor, ...]
+
+
+class EvaluateConfig(Section):
+    """Section `evaluate`."""
+
+
+STAGE_SECTIONS: dict[str, type[Section]] = {
+    "capture": CaptureConfig,
+    "mask": MaskConfig,
+    "fit": FitConfig,
+    "train": TrainConfig,
+    "render": RenderConfig,
+    "annotate": AnnotateConfig,
+    "assemble": AssembleConfig,
+    "evaluate": EvaluateConfig,
+}
+
+
+class CaptureKeys(Section):
+    """What the YAML may say about `capture`; the workflow adds the rest."""
+
+
+class AssembleKeys(Section):
+    """What the YAML may say about `assemble`; the workflow adds the rest."""
+
+
+class Config(Section):
+    """The whole configuration, as merged from the YAML files."""
+
+    dataset: str = Field(pattern=r"^[a-z0-9_]+$")
+    actors: str = Field(description="Path of the actors table (TSV).")
+    sequences: str = Field(description="Path of the sequences table (TSV).")
+    sources: dict[str, Source]
+    capture: CaptureKeys = CaptureKeys()
+    mask: MaskConfig = MaskConfig()
+    fit: FitConfig = FitConfig()
+    train: TrainConfig = TrainConfig()
+    render: RenderConfig
+    annotate: AnnotateConfig = AnnotateConfig()
+    assemble: AssembleKeys = AssembleKeys()
+    evaluate: EvaluateConfig = EvaluateConfig()
+
+
+def read_config(merged: dict[str, Any]) -> Config:
+    """The validated configuration.
+
+    Raises:
+        ConfigError: names every wrong key with its place, and the replacement of a retired one.
+    """
+    try:
+        return Config.model_validate(merged)
+    except ValidationError as error:
+        raise ConfigError(explain(error, "configuration")) from error
+
+
+def explain(error: ValidationError, what: str) -> str:
+    """A validation error in words: where, got, expected, remedy."""
+    lines = [f"the {what} is not usable:"]
+    for item in error.errors():
+        place = ".".join(str(part) for part in item["loc"])
+        key = str(item["loc"][-1]) if item["loc"] else ""
+        if item["type"] == "extra_forbidden":
+            hint = RETIRED_KEYS.get(key, "check the spelling; config/README.md lists all keys")
+            lines.append(f"  {place}: unknown key; {hint}")
+        else:
+            lines.append(f"  {place}: {item['msg']}, got {item.get('input')!r}")
+    return "\n".join(lines)

@@ -1,0 +1,162 @@
+"""Image files: straight-alpha RGBA, depth, part labels and mattes as deterministic PNG.
+
+Values are rounded to nearest: truncation costs 6 dB of the 58.9 dB that 8 bits allow and darkens
+every image by half a level. Colours are stored straight (not multiplied by alpha), because at
+alpha 0.02 un-premultiplying eight bits is off by 26 levels.
+"""
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+from numpy import ndarray
+
+from ntop.conventions import DEPTH_STEP_M, DataError
+from ntop.storage.atomic import write_bytes
+
+# Level 3 with run-length strategy: most of a virtual top view is empty; bytes depend on the data only
+PNG_OPTIONS = (
+    cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
+)  # fmt: skip
+DILATION_PX = 3  # straight colour reaches this far beyond alpha > 0: resampling never mixes in black
+DEPTH_LIMIT_M = 65535 * DEPTH_STEP_M
+
+
+def encode_rgba(
+    rgb: Float[ndarray, "height width 3"], alpha: Float[ndarray, "height width"]
+) -> bytes:
+    """PNG bytes of straight sRGB colour and alpha, both in [0, 1], rounded to nearest.
+
+    Colour is carried `DILATION_PX` beyond alpha > 0, so that scaling or recompositing the file
+    shows no dark fringe; further out it is zero.
+    """
+    if rgb.shape[:2] != alpha.shape or rgb.shape[2:] != (3,):
+        raise DataError(f"RGBA image: colour {rgb.shape} and alpha {alpha.shape} do not match")
+    pixels = np.zeros((*alpha.shape, 4), np.uint8)
+    quantised = eight_bit(alpha)
+    rows, columns = quantised.any(1).nonzero()[0], quantised.any(0).nonzero()[0]
+    if len(rows):  # only the person's box is converted: 4 % of a usual view
+        top, bottom = max(rows[0] - DILATION_PX, 0), rows[-1] + DILATION_PX + 1
+        left, right = max(columns[0] - DILATION_PX, 0), columns[-1] + DILATION_PX + 1
+        box = np.s_[top:bottom, left:right]
+        pixels[box][..., :3] = _dilated(eight_bit(rgb[box]), quantised[box] > 0)
+        pixels[box][..., 3] = quantised[box]
+    return _encode(cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA))
+
+
+def encode_depth(depth_m: Float[ndarray, "height width"]) -> bytes:
+    """PNG bytes of ray lengths in metres, 16 bit, `DEPTH_STEP_M` per step; 0 means nothing there.
+
+    Raises:
+        DataError: a length beyond 6.5535 m, negative or not finite: it would wrap silently.
+    """
+    lowest, highest = float(depth_m.min()), float(depth_m.max())
+    if not (lowest >= 0 and highest <= DEPTH_LIMIT_M):
+        raise DataError(
+            f"depth image: values {lowest} .. {highest} m, expected 0 .. {DEPTH_LIMIT_M:.4f} m; "
+            "lower the rig or crop the scene"
+        )
+    return _encode(np.rint(depth_m.astype(np.float64) / DEPTH_STEP_M).astype(np.uint16))
+
+
+def encode_parts(parts: UInt8[ndarray, "height width"]) -> bytes:
+    """PNG bytes of part labels: skinning bone + 1, 0 where there is nothing."""
+    return _encode(parts)
+
+
+def encode_matte(matte: Float[ndarray, "height width"]) -> bytes:
+    """PNG bytes of a soft mask in [0, 1], rounded to 8 bit."""
+    return _encode(eight_bit(matte))
+
+
+def write_rgba(
+    rgb: Float[ndarray, "height width 3"], alpha: Float[ndarray, "height width"], *, path: Path
+) -> str:
+    """Write an RGBA image (see `encode_rgba`); returns the SHA-256 of the file."""
+    content = encode_rgba(rgb, alpha)
+    write_bytes(path, content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def write_depth(depth_m: Float[ndarray, "height width"], *, path: Path) -> None:
+    """Write ray lengths in metres (see `encode_depth`)."""
+    write_bytes(path, encode_depth(depth_m))
+
+
+def write_parts(parts: UInt8[ndarray, "height width"], *, path: Path) -> None:
+    """Write part labels, bone + 1 (see `encode_parts`)."""
+    write_bytes(path, encode_parts(parts))
+
+
+def write_matte(matte: Float[ndarray, "height width"], *, path: Path) -> None:
+    """Write a soft mask in [0, 1] (see `encode_matte`)."""
+    write_bytes(path, encode_matte(matte))
+
+
+def read_rgba(path: Path) -> UInt8[ndarray, "height width 4"]:
+    """Straight-alpha RGBA, 8 bit; the mask is channel 3 >= `MASK_ALPHA`."""
+    pixels = _read(path, channels=4, dtype=np.uint8)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
+
+
+def read_depth(path: Path) -> Float[ndarray, "height width"]:
+    """Ray lengths in metres (float32), 0 where there is nothing."""
+    steps: UInt16[ndarray, "height width"] = _read(path, channels=1, dtype=np.uint16)
+    return steps.astype(np.float32) * np.float32(DEPTH_STEP_M)
+
+
+def read_parts(path: Path) -> UInt8[ndarray, "height width"]:
+    """Part labels: bone + 1, 0 where there is nothing."""
+    return _read(path, channels=1, dtype=np.uint8)
+
+
+def read_matte(path: Path) -> Float[ndarray, "height width"]:
+    """A soft mask in [0, 1], float32."""
+    return _read(path, channels=1, dtype=np.uint8).astype(np.float32) / np.float32(255)
+
+
+def eight_bit(values: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape"]:
+    """Values in [0, 1] as 0..255, rounded to nearest (half to even) and clipped."""
+    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _dilated(
+    rgb: UInt8[ndarray, "height width 3"], inside: np.ndarray
+) -> UInt8[ndarray, "height width 3"]:
+    """Colour inside; beyond, within DILATION_PX, the mean of the colours inside near by."""
+    size = (2 * DILATION_PX + 1, 2 * DILATION_PX + 1)
+    weight = inside.astype(np.float32)
+    total = cv2.boxFilter(weight, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    colour = cv2.boxFilter(
+        rgb.astype(np.float32) * weight[..., None],
+        -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT,
+    )  # fmt: skip
+    near = np.rint(colour / np.maximum(total, 1)[..., None]).astype(np.uint8)
+    return np.where(inside[..., None], rgb, near)
+
+
+def _encode(pixels: np.ndarray) -> bytes:
+    _, content = cv2.imencode(".png", pixels, PNG_OPTIONS)
+    return content.tobytes()
+
+
+def _read(path: Path, *, channels: int, dtype: type) -> np.ndarray:
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DataError(
+            f"cannot read image {path}: {error.strerror or error}; "
+            "rerun the stage that writes it"
+        ) from error
+    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if pixels is None:
+        raise DataError(f"{path} is not a whole PNG; delete it and rerun the stage that writes it")
+    got = 1 if pixels.ndim == 2 else pixels.shape[2]
+    if got != channels or pixels.dtype != dtype:
+        raise DataError(
+            f"{path}: {got} channels of {pixels.dtype}, expected {channels} of "
+            f"{np.dtype(dtype)}; it is another kind of image"
+        )
+    return pixels

@@ -10,17 +10,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from ntop.conventions import DEPTH_STEP_M, DataError
 from ntop.storage.atomic import write_bytes
+from ntop.storage.png import encode_png
 
-# Level 3 with run-length strategy: most of a virtual top view is empty; bytes depend on the data only
-PNG_OPTIONS = (
-    cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
-)  # fmt: skip
-DILATION_PX = 3  # straight colour reaches this far beyond alpha > 0: resampling never mixes in black
+DILATION_PX = 3  # straight colour reaches this far beyond alpha > 0: scaling mixes in no black
 DEPTH_LIMIT_M = 65535 * DEPTH_STEP_M
 
 
@@ -43,7 +40,7 @@ def encode_rgba(
         box = np.s_[top:bottom, left:right]
         pixels[box][..., :3] = _dilated(eight_bit(rgb[box]), quantised[box] > 0)
         pixels[box][..., 3] = quantised[box]
-    return _encode(cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA))
+    return encode_png(pixels)
 
 
 def encode_depth(depth_m: Float[ndarray, "height width"]) -> bytes:
@@ -58,17 +55,17 @@ def encode_depth(depth_m: Float[ndarray, "height width"]) -> bytes:
             f"depth image: values {lowest} .. {highest} m, expected 0 .. {DEPTH_LIMIT_M:.4f} m; "
             "lower the rig or crop the scene"
         )
-    return _encode(np.rint(depth_m.astype(np.float64) / DEPTH_STEP_M).astype(np.uint16))
+    return encode_png(np.rint(depth_m.astype(np.float64) / DEPTH_STEP_M).astype(np.uint16))
 
 
 def encode_parts(parts: UInt8[ndarray, "height width"]) -> bytes:
     """PNG bytes of part labels: skinning bone + 1, 0 where there is nothing."""
-    return _encode(parts)
+    return encode_png(parts)
 
 
 def encode_matte(matte: Float[ndarray, "height width"]) -> bytes:
     """PNG bytes of a soft mask in [0, 1], rounded to 8 bit."""
-    return _encode(eight_bit(matte))
+    return encode_png(eight_bit(matte))
 
 
 def write_rgba(
@@ -103,7 +100,7 @@ def read_rgba(path: Path) -> UInt8[ndarray, "height width 4"]:
 
 def read_depth(path: Path) -> Float[ndarray, "height width"]:
     """Ray lengths in metres (float32), 0 where there is nothing."""
-    steps: UInt16[ndarray, "height width"] = _read(path, channels=1, dtype=np.uint16)
+    steps = _read(path, channels=1, dtype=np.uint16)
     return steps.astype(np.float32) * np.float32(DEPTH_STEP_M)
 
 
@@ -137,18 +134,12 @@ def _dilated(
     return np.where(inside[..., None], rgb, near)
 
 
-def _encode(pixels: np.ndarray) -> bytes:
-    _, content = cv2.imencode(".png", pixels, PNG_OPTIONS)
-    return content.tobytes()
-
-
 def _read(path: Path, *, channels: int, dtype: type) -> np.ndarray:
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise DataError(
-            f"cannot read image {path}: {error.strerror or error}; "
-            "rerun the stage that writes it"
+            f"cannot read image {path}: {error.strerror or error}; rerun the stage that writes it"
         ) from error
     pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
     if pixels is None:

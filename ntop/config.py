@@ -6,6 +6,8 @@ section as JSON (`stage_section`), so that a stage can be run alone and a change
 exactly that stage and what follows from it.
 """
 
+import csv
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -119,13 +121,31 @@ class StudioSource(SourceSection):
 Source = Annotated[QualisysSource | StudioSource, Field(discriminator="reader")]
 
 
+class RigConfig(Section):
+    """One setting of the nine-camera rig (paper section 3.2)."""
+
+    height_above_pelvis_m: float = Field(gt=0)
+    ring_radius_m: float = Field(ge=0)
+
+
+class ImageConfig(Section):
+    """Size and lens of the virtual fisheye images."""
+
+    width_px: int = Field(default=1000, ge=16)
+    height_px: int = Field(default=1000, ge=16)
+    focal_px: float | None = Field(
+        default=None, gt=0, description="Pixels per radian; default min(width, height) / pi."
+    )
+    max_theta_deg: float = Field(default=90.0, gt=0, lt=180)
+
+
 class CaptureConfig(Section):
     """Section `capture`, completed by the workflow with the actor's source and sequences."""
 
     source_section: Source
     sequences: tuple[Sequence, ...]
-    rigs: dict[str, "RigConfig"] = Field(default_factory=dict, description="For studio truth.")
-    image: "ImageConfig"
+    rigs: dict[str, RigConfig] = Field(default_factory=dict, description="For studio truth.")
+    image: ImageConfig = ImageConfig()
 
 
 class MaskConfig(Section):
@@ -150,24 +170,6 @@ class TrainConfig(Section):
     steps: int = Field(default=1500, ge=1)
     rays_per_batch: int = Field(default=4096, ge=64)
     seed: int = 0
-
-
-class RigConfig(Section):
-    """One setting of the nine-camera rig (paper section 3.2)."""
-
-    height_above_pelvis_m: float = Field(gt=0)
-    ring_radius_m: float = Field(ge=0)
-
-
-class ImageConfig(Section):
-    """Size and lens of the virtual fisheye images."""
-
-    width_px: int = Field(default=1000, ge=16)
-    height_px: int = Field(default=1000, ge=16)
-    focal_px: float | None = Field(
-        default=None, gt=0, description="Pixels per radian; default min(width, height) / pi."
-    )
-    max_theta_deg: float = Field(default=90.0, gt=0, lt=180)
 
 
 class RenderConfig(Section):
@@ -256,3 +258,106 @@ def explain(error: ValidationError, what: str) -> str:
         else:
             lines.append(f"  {place}: {item['msg']}, got {item.get('input')!r}")
     return "\n".join(lines)
+
+
+def read_tsv(path: Path, kind: type[Section]) -> list[Any]:
+    """Rows of a tab-separated table as sections; `-` or an empty cell means the default.
+
+    Raises:
+        ConfigError: the file is missing, or a row is not usable.
+    """
+    try:
+        with path.open(newline="") as stream:
+            rows = list(csv.DictReader(stream, delimiter="\t"))
+    except OSError as error:
+        raise ConfigError(f"cannot read table {path}: {error.strerror}") from error
+    sections = []
+    for number, row in enumerate(rows, start=2):
+        given = {key: cell for key, cell in row.items() if cell not in {"", "-", None}}
+        try:
+            sections.append(kind.model_validate(given))
+        except ValidationError as error:
+            raise ConfigError(explain(error, f"table {path} line {number}")) from error
+    return sections
+
+
+def check_tables(config: Config, actors: list[Actor], sequences: list[Sequence]) -> None:
+    """Refuse tables that contradict each other or the configuration.
+
+    Raises:
+        ConfigError: an actor is in two splits or listed twice, a source or actor is unknown,
+            two sequences render the same sets, or frames run backwards.
+    """
+    splits: dict[tuple[str, str], str] = {}
+    for actor in actors:
+        key = (actor.source, actor.actor)
+        if actor.source not in config.sources:
+            raise ConfigError(
+                f"{config.actors}: source {actor.source!r} of actor {actor.actor!r} is not in "
+                f"`sources`, have {sorted(config.sources)}"
+            )
+        if key in splits:
+            raise ConfigError(
+                f"{config.actors}: actor {actor.source}/{actor.actor} is listed twice "
+                f"(split {splits[key]} and {actor.split}); an actor belongs to one split, so that "
+                "nobody is seen in training and in validation: keep one line"
+            )
+        splits[key] = actor.split
+    seen: set[tuple[str, str, str, str]] = set()
+    for row in sequences:
+        place = f"{config.sequences}: {row.source}/{row.actor}/{row.action}"
+        if (row.source, row.actor) not in splits:
+            raise ConfigError(f"{place}: this actor is not in {config.actors}")
+        if row.last < row.first:
+            raise ConfigError(f"{place}: last frame {row.last} lies before first {row.first}")
+        key = (row.source, row.actor, row.action, row.use)
+        if key in seen:
+            raise ConfigError(f"{place}: two lines with use={row.use}; give one another action")
+        seen.add(key)
+        if (
+            row.use == "render"
+            and row.action
+            in {
+                s.action
+                for s in sequences
+                if (s.source, s.actor, s.use) == (row.source, row.actor, "train")
+            }
+            and row.motion
+        ):
+            raise ConfigError(
+                f"{place}: a recorded action cannot also be a motion; choose another action name"
+            )
+    for source, actor in splits:
+        uses = {s.use for s in sequences if (s.source, s.actor) == (source, actor)}
+        if uses != {"train", "render"}:
+            raise ConfigError(
+                f"{config.sequences}: {source}/{actor} has lines for {sorted(uses)}; expected at "
+                "least one with use=train and one with use=render"
+            )
+
+
+def stage_section(
+    config: Config,
+    stage: str,
+    *,
+    source: str | None = None,
+    extra: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The values one stage's jobs get: its section, its source's overrides, and `extra`.
+
+    Raises:
+        ConfigError: an override names a key the stage does not have.
+    """
+    values = getattr(config, stage).model_dump(mode="json", exclude_defaults=True)
+    kind = STAGE_SECTIONS[stage]
+    if source is not None:
+        section = config.sources[source]
+        given = {"provides": section.provides, "held_out_views": section.held_out_views}
+        values |= {key: list(v) for key, v in given.items() if v and key in kind.model_fields}
+        values |= section.overrides.get(stage, {})
+    values |= extra or {}
+    try:
+        kind.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(explain(error, f"section {stage} of source {source}")) from error
+    return values

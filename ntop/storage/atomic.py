@@ -39,6 +39,29 @@ def write_bytes(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+@contextmanager
+def atomic_folder(target: Path) -> Iterator[Path]:
+    """A work folder beside `target`; it becomes `target` when the block ends without an error.
+
+    What a killed run left in the work folder is removed first.
+
+    Raises:
+        DataError: the folder cannot be made or published, or the disk is full.
+    """
+    work = target.with_name(f".{target.name}.partial")
+    try:
+        if work.exists():
+            shutil.rmtree(work)
+        work.mkdir(parents=True)
+    except OSError as error:
+        raise DataError(
+            f"cannot make folder {work}: {error.strerror or error}; "
+            "check the permissions and the free space"
+        ) from error
+    yield work
+    publish_folder(work, target)
+
+
 def publish_folder(work: Path, target: Path) -> None:
     """Make the finished folder `work` become `target` in one rename.
 

@@ -1,0 +1,114 @@
+"""`ntop <verb> ...`: every stage and tool, its flags derived from its `main` signature.
+
+A stage's `config` flag takes the JSON that the workflow logs, so a logged command line is a
+complete recipe. Its `version` must be the stage's own, or the run is refused.
+"""
+
+import argparse
+import importlib
+import inspect
+import json
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from ntop.config import explain
+from ntop.conventions import ConfigError, NtopError
+from ntop.stages import STAGES
+
+TOOLS = ("check", "fetch")
+EXIT_USER_ERROR = 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one verb; an error meant for people ends with its text and exit code 2."""
+    words = sys.argv[1:] if arguments is None else arguments
+    verbs = {name: f"ntop.stages.s{number}_{name}" for number, name, _ in STAGES}
+    verbs |= {name: f"ntop.tools.{name}" for name in TOOLS}
+    if not words or words[0] in {"-h", "--help"}:
+        sys.stdout.write(f"usage: ntop <verb> --help\nverbs: {', '.join(verbs)}\n")
+        return 0
+    verb, *rest = words
+    if verb not in verbs:
+        sys.stderr.write(f"ntop: unknown verb {verb!r}; have {', '.join(verbs)}\n")
+        return EXIT_USER_ERROR
+    entry = importlib.import_module(verbs[verb]).main
+    try:
+        entry(**parse(entry, verb=verb, words=rest))
+    except NtopError as error:
+        sys.stderr.write(f"ntop {verb}: {error}\n")
+        return EXIT_USER_ERROR
+    return 0
+
+
+def parse(entry: Callable[..., None], *, verb: str, words: list[str]) -> dict[str, Any]:
+    """Values for the parameters of `entry`, read from command line words."""
+    parser = argparse.ArgumentParser(
+        prog=f"ntop {verb}",
+        description=inspect.getdoc(entry),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parameters = inspect.signature(entry).parameters
+    for name, parameter in parameters.items():
+        kind, many = _kind(parameter.annotation)
+        required = parameter.default is inspect.Parameter.empty
+        parser.add_argument(
+            f"--{name.replace('_', '-')}",
+            type=_reader(kind, verb=verb),
+            nargs="*" if many else None,
+            required=required,
+            default=None if required else parameter.default,
+            metavar=kind.__name__,
+        )
+    return vars(parser.parse_args(words))
+
+
+def _kind(annotation: Any) -> tuple[type, bool]:
+    """The type to read and whether several values are taken (`list[T]`)."""
+    if get_origin(annotation) in {Union, types.UnionType}:
+        annotation = next(a for a in get_args(annotation) if a is not type(None))
+    if get_origin(annotation) is list:
+        return get_args(annotation)[0], True
+    return annotation, False
+
+
+def _reader(kind: type, *, verb: str) -> Callable[[str], Any]:
+    if not issubclass(kind, BaseModel):
+        return kind
+
+    def read(text: str) -> BaseModel:
+        return read_section(text, kind=kind, verb=verb)
+
+    return read
+
+
+def read_section(text: str, *, kind: type[BaseModel], verb: str) -> BaseModel:
+    """A stage's section from JSON text or from the path of a JSON file.
+
+    Raises:
+        ConfigError: not JSON, a wrong version, or values the section refuses.
+    """
+    source = text if text.lstrip().startswith("{") else Path(text).read_text()
+    try:
+        values = json.loads(source)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"--config is not JSON: {error}") from error
+    version = next(version for _, name, version in STAGES if name == verb)
+    given = values.pop("version", version)
+    if given != version:
+        raise ConfigError(
+            f"the configuration is for version {given} of stage {verb}, this is version "
+            f"{version}: rerun the workflow with this version of ntop"
+        )
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(explain(error, f"section {verb}")) from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

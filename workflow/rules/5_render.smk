@@ -1,0 +1,35 @@
+# avatar, bodies, rig -> fisheye RGBA, depth, parts
+def render_packages(wildcards):
+    return package_folders(motion_packages([render_row(wildcards)]))
+
+
+def render_motion(wildcards):
+    return render_row(wildcards).motion
+
+
+rule render:
+    input:
+        avatar="results/4_train/{source}/{actor}",
+        bodies=body_folder,
+        packages=render_packages,
+    output:
+        directory("results/5_render/{source}/{actor}/{action}/{rig}/{shard}"),
+    log:
+        "logs/5_render/{source}/{actor}/{action}/{rig}/{shard}.log",
+    benchmark:
+        "results/benchmarks/5_render/{source}/{actor}/{action}/{rig}/{shard}.tsv"
+    resources:
+        mem_mb=3000,
+        gpu=0,
+    params:
+        config=stage_params("render"),
+        packages=PACKAGES,
+        motion=render_motion,
+        frames=shard_frames,
+        work="results/work/5_render/{source}/{actor}/{action}/{rig}/{shard}",
+    shell:
+        "ntop render --config {params.config:q} --source {wildcards.source}"
+        " --actor {wildcards.actor} --action {wildcards.action} --rig {wildcards.rig}"
+        " --frames {params.frames} --motion {params.motion:q} --avatar {input.avatar:q}"
+        " --bodies {input.bodies:q}/bodies.parquet --packages {params.packages:q}"
+        " --work {params.work:q} --out {output:q} 2> {log:q}"

@@ -1,0 +1,17 @@
+# renders -> 2D and 3D keypoints, visibility, boxes, areas, RLE
+rule annotate:
+    input:
+        renders="results/5_render/{source}/{actor}/{action}/{rig}/{shard}",
+    output:
+        "results/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.parquet",
+    log:
+        "logs/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.log",
+    benchmark:
+        "results/benchmarks/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.tsv"
+    resources:
+        mem_mb=1000,
+    params:
+        config=stage_params("annotate"),
+    shell:
+        "ntop annotate --config {params.config:q} --renders {input.renders:q}"
+        " --out {output:q} 2> {log:q}"

@@ -1,0 +1,23 @@
+# all shards -> manifest, COCO and SMPL files, sets, card
+def assemble_params(wildcards):
+    actors = [row.model_dump(mode="json") for row in ACTORS]
+    return params_json("assemble", None, {"dataset": wildcards.dataset, "actors": actors})
+
+
+rule assemble:
+    input:
+        renders=[f"results/5_render/{shard}" for shard in SHARDS],
+        annotations=[f"results/6_annotate/{shard}.parquet" for shard in SHARDS],
+    output:
+        directory("results/7_assemble/{dataset}"),
+    log:
+        "logs/7_assemble/{dataset}.log",
+    benchmark:
+        "results/benchmarks/7_assemble/{dataset}.tsv"
+    resources:
+        mem_mb=2000,
+    params:
+        config=assemble_params,
+    shell:
+        "ntop assemble --config {params.config:q} --renders {input.renders:q}"
+        " --annotations {input.annotations:q} --out {output:q} 2> {log:q}"

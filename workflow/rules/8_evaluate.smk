@@ -1,0 +1,34 @@
+# dataset, captures, avatars -> metrics and report
+def actor_folders(folder_of):
+    """One folder per actor, in the order of the actors table, each once."""
+
+    def folders(wildcards):
+        return [folder_of(actor) for actor in ACTORS]
+
+    return folders
+
+
+rule evaluate:
+    input:
+        dataset="results/7_assemble/{dataset}",
+        captures=actor_folders(capture_folder),
+        mattes=actor_folders(matte_folder),
+        bodies=actor_folders(body_folder),
+        avatars=[f"results/4_train/{actor.source}/{actor.actor}" for actor in ACTORS],
+    output:
+        directory("results/8_evaluate/{dataset}"),
+    log:
+        "logs/8_evaluate/{dataset}.log",
+    benchmark:
+        "results/benchmarks/8_evaluate/{dataset}.tsv"
+    threads: 2
+    resources:
+        mem_mb=4000,
+    params:
+        config=stage_params("evaluate"),
+        benchmarks="results/benchmarks",
+    shell:
+        "ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
+        " --captures {input.captures:q} --mattes {input.mattes:q} --bodies {input.bodies:q}"
+        " --avatars {input.avatars:q} --benchmarks {params.benchmarks:q}"
+        " --out {output:q} 2> {log:q}"

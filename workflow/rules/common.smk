@@ -1,0 +1,125 @@
+# Parse-time data and small functions: configuration, tables, paths, stage parameters.
+import json
+import sys
+from pathlib import Path
+
+from ntop.config import (
+    Actor,
+    Sequence,
+    check_tables,
+    read_config,
+    read_tsv,
+    stage_section,
+)
+from ntop.conventions import ConfigError
+from ntop.stages import STAGES
+
+try:
+    CONFIG = read_config(config)
+    ACTORS = read_tsv(Path(CONFIG.actors), Actor)
+    SEQUENCES = read_tsv(Path(CONFIG.sequences), Sequence)
+    check_tables(CONFIG, ACTORS, SEQUENCES)
+except ConfigError as error:
+    sys.exit(f"ntop: {error}")
+
+VERSIONS = {name: version for _, name, version in STAGES}
+PACKAGES = "data/packages"
+KEY = "{source}/{actor}"
+
+
+wildcard_constraints:
+    source="[a-z0-9_]+",
+    actor="[a-z0-9_]+",
+    action="[a-z0-9_]+",
+    rig="[a-z0-9_.]+",
+    shard="[0-9]{6}",
+
+
+def params_json(stage, source=None, extra=None):
+    """A stage's section and version as sorted JSON: a changed value reruns that stage."""
+    values = stage_section(CONFIG, stage, source=source, extra=extra)
+    return json.dumps(values | {"version": VERSIONS[stage]}, sort_keys=True)
+
+
+def stage_params(stage):
+    """A params function for a stage whose section depends on the source only."""
+
+    def section_of(wildcards):
+        return params_json(stage, getattr(wildcards, "source", None))
+
+    return section_of
+
+
+def sequences_of(wildcards, use):
+    """The actor's sequences of one use."""
+    key = (wildcards.source, wildcards.actor, use)
+    return [row for row in SEQUENCES if (row.source, row.actor, row.use) == key]
+
+
+def given(wildcards, what):
+    """Whether the source brings `what` along, so that no stage computes it."""
+    return what in CONFIG.sources[wildcards.source].provides
+
+
+def capture_folder(wildcards):
+    return f"results/1_capture/{wildcards.source}/{wildcards.actor}"
+
+
+def mask_folder(wildcards):
+    if given(wildcards, "masks") and given(wildcards, "keypoints2d"):
+        return capture_folder(wildcards)
+    return f"results/2_mask/{wildcards.source}/{wildcards.actor}"
+
+
+def matte_folder(wildcards):
+    """Where the mattes lie that training reads."""
+    if given(wildcards, "masks"):
+        return capture_folder(wildcards)
+    return mask_folder(wildcards)
+
+
+def body_folder(wildcards):
+    """Where bodies and cameras lie: given ones come with the capture."""
+    if given(wildcards, "bodies"):
+        return capture_folder(wildcards)
+    return f"results/3_fit/{wildcards.source}/{wildcards.actor}"
+
+
+def package_folders(names):
+    return [f"{PACKAGES}/{name}" for name in names]
+
+
+def motion_packages(rows):
+    """The packages that the motions of these sequences come from."""
+    return ["pybullet"] if any(row.motion.startswith("deepmimic:") for row in rows) else []
+
+
+def shards_of(row):
+    """First frames of the shards a render sequence is cut into."""
+    frames = list(row.frames)
+    return [frames[i] for i in range(0, len(frames), CONFIG.render.sets_per_shard)]
+
+
+def render_row(wildcards):
+    """The render sequence that a shard belongs to."""
+    return next(
+        row
+        for row in sequences_of(wildcards, "render")
+        if row.action == wildcards.action
+    )
+
+
+def shard_frames(wildcards):
+    """The frames (sets) of one shard."""
+    frames = list(render_row(wildcards).frames)
+    start = frames.index(int(wildcards.shard))
+    return frames[start : start + CONFIG.render.sets_per_shard]
+
+
+SHARDS = [
+    f"{row.source}/{row.actor}/{row.action}/{rig}/{first:06d}"
+    for row in SEQUENCES
+    if row.use == "render"
+    for rig in CONFIG.render.rigs
+    for first in shards_of(row)
+]

@@ -15,7 +15,7 @@ from torch import Tensor
 from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.geometry.rigid import RigidTransform
 
-UNDISTORT_ITERATIONS = 10  # Newton; mild lenses converge in 3-5
+UNDISTORT_ITERATIONS = 10  # fixed point; mild lenses converge in 3-5
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             "check the folder's permissions and the free space, then run the same command again"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if path.parent.is_dir():
+            temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -1,0 +1,41 @@
+# make demo   real capture -> dataset -> report        make test   everything CI runs
+# make studio synthetic capture with known truth       make bench  run time against error
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV ?= .venv
+CORES ?= 2
+BIN := $(abspath $(VENV))/bin
+RUN := PATH="$(BIN):$$PATH"
+
+.PHONY: env demo studio test lint rulegraph clean-cache
+
+env: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
+	  sys.exit(0 if (3, 11) <= v <= (3, 13) else \
+	  f"ntop needs Python 3.11, 3.12 or 3.13, found {v[0]}.{v[1]}; run: make env PYTHON=python3.11")'
+	@$(PYTHON) -m venv $(VENV) || { echo "ntop: cannot make a virtual environment; \
+	  on Debian: apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: env
+	@$(RUN) workflow/run.sh demo $(CORES)
+
+studio: env
+	@$(RUN) workflow/run.sh studio $(CORES) --configfile config/studio.yaml
+
+test: env lint
+	$(RUN) python -m pytest -n $(CORES)
+
+lint: env
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) snakefmt --check Snakefile workflow
+	$(RUN) lint-imports
+	$(RUN) snakemake --lint
+
+rulegraph: env
+	$(RUN) scripts/draw_rulegraph.sh

@@ -93,8 +93,10 @@ class QualisysSource(SourceSection):
     calibration: str = Field(description="Path of the .qca.txt file below the package folder.")
     views: tuple[str, ...]
     trials: dict[str, QualisysTrial] = Field(description="Action -> trial.")
-    letterbox_offset_px: float = Field(
-        default=7.06, description="Vertical offset of a letter-boxed copy of the calibrated image."
+    letterbox_sizes_px: tuple[tuple[int, int], ...] = Field(
+        default=(),
+        description="Video sizes (width, height) known to be letter-boxed copies of the "
+        "calibrated image: scaled to fit, centred between bars.",
     )
     pose2sim_compat: bool = Field(
         default=False, description="Divide the distortion by 64, as Pose2Sim does."

@@ -14,10 +14,10 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import torch
 
+from ntop.config import QualisysSource, Sequence
 from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.geometry.cameras import Camera, Pinhole
 from ntop.storage import schemas
@@ -34,31 +34,12 @@ OPENCV_FROM_QUALISYS = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.fl
 SizePx = tuple[int, int]  # width, height
 
 
-class SequenceLike(Protocol):
-    """A declared run of frames of one action; `last` is included."""
-
-    action: str
-    first: int
-    last: int
-    step: int
-
-
-class QualisysSettings(Protocol):
-    """What the reader must be told; paths are relative to the folder of fetched packages."""
-
-    calibration: str
-    videos: dict[str, str]
-    views: tuple[str, ...]
-    letterbox_sizes_px: tuple[SizePx, ...]
-    pose2sim_compat: bool
-
-
 def capture_qualisys(
-    settings: QualisysSettings,
+    settings: QualisysSource,
     *,
     source: str,
     actor: str,
-    sequences: Iterable[SequenceLike],
+    sequences: Iterable[Sequence],
     packages: Path,
     out: Path,
 ) -> None:
@@ -71,7 +52,8 @@ def capture_qualisys(
             belong to the calibration, the views of an action differ in length, or a declared
             frame does not exist.
     """
-    calibration_path = packages / settings.calibration
+    package = packages / settings.package
+    calibration_path = package / settings.calibration
     calibrated = read_qca(calibration_path, pose2sim_compat=settings.pose2sim_compat)
     missing = sorted(set(settings.views) - set(calibrated))
     if missing:
@@ -82,12 +64,12 @@ def capture_qualisys(
     cameras: dict[CameraKey, Camera] = {}
     rows: list[Row] = []
     for action, frames in _frames_by_action(sequences).items():
-        if action not in settings.videos:
+        if action not in settings.trials:
             raise DataError(
-                f"{source}/{actor}: action {action!r} is declared, but its folder of videos is "
-                f"not; `videos` of the source names {', '.join(sorted(settings.videos))}"
+                f"{source}/{actor}: action {action!r} is declared, but not among the trials of "
+                f"the source, {', '.join(sorted(settings.trials))}; add it to `trials`"
             )
-        folder = packages / settings.videos[action]
+        folder = package / settings.trials[action].videos
         videos = find_videos(folder, views=settings.views)
         _check_lengths(videos, action=action, frames=frames)
         for view, video in videos.items():
@@ -274,12 +256,11 @@ def _number(element: ElementTree.Element, name: str, *, where: str) -> float:
         ) from error
 
 
-def _frames_by_action(sequences: Iterable[SequenceLike]) -> dict[str, list[int]]:
+def _frames_by_action(sequences: Iterable[Sequence]) -> dict[str, list[int]]:
     """Union of the declared frames, per action, ascending."""
     frames: dict[str, set[int]] = {}
     for sequence in sequences:
-        chosen = range(sequence.first, sequence.last + 1, sequence.step)
-        frames.setdefault(sequence.action, set()).update(chosen)
+        frames.setdefault(sequence.action, set()).update(sequence.frames)
     return {action: sorted(chosen) for action, chosen in sorted(frames.items())}
 
 

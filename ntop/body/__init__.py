@@ -1,0 +1,1 @@
+"""The body: skeletons, SMPL-format models, skinning, motions and pose fitting."""

@@ -92,7 +92,10 @@ def read_section(text: str, *, kind: type[BaseModel], verb: str) -> BaseModel:
     Raises:
         ConfigError: not JSON, a wrong version, or values the section refuses.
     """
-    source = text if text.lstrip().startswith("{") else Path(text).read_text()
+    try:
+        source = text if text.lstrip().startswith("{") else Path(text).read_text()
+    except OSError as error:
+        raise ConfigError(f"cannot read --config {text}: {error.strerror}") from error
     try:
         values = json.loads(source)
     except json.JSONDecodeError as error:

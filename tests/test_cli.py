@@ -1,0 +1,55 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from ntop import cli
+from ntop.config import RenderConfig, TrainConfig
+from ntop.conventions import ConfigError
+
+RIGS = {"a": {"height_above_pelvis_m": 1.0, "ring_radius_m": 0.5}}
+
+
+def entry(config: RenderConfig, out: Path, frames: list[int], motion: str, seed: int = 3) -> None:
+    """Stand-in with every kind of parameter."""
+
+
+def test_flags_come_from_the_signature():
+    words = ["--config", json.dumps({"rigs": RIGS, "version": 1}), "--out", "x", "--motion", ""]
+    values = cli.parse(entry, verb="render", words=[*words, "--frames", "3", "4"])
+    assert values["config"].rigs["a"].ring_radius_m == 0.5
+    assert values["out"] == Path("x")
+    assert values["frames"] == [3, 4]
+    assert values["motion"] == ""
+    assert values["seed"] == 3
+
+
+def test_a_config_file_serves_as_well(tmp_path):
+    path = tmp_path / "train.json"
+    path.write_text('{"steps": 7}')
+    assert cli.read_section(str(path), kind=TrainConfig, verb="train").steps == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"version": 99}', "version 99 of stage train"),
+        ('{"stepz": 1}', "stepz: unknown key"),
+        ("{nonsense", "not JSON"),
+        ("missing.json", "cannot read"),
+    ],
+)
+def test_a_wrong_config_is_refused_in_words(text, words):
+    with pytest.raises(ConfigError, match=words):
+        cli.read_section(text, kind=TrainConfig, verb="train")
+
+
+def test_an_unknown_verb_lists_the_known_ones(capsys):
+    assert cli.main(["paint"]) == cli.EXIT_USER_ERROR
+    assert "capture, mask, fit, train" in capsys.readouterr().err
+
+
+def test_an_error_for_people_has_no_traceback(capsys, tmp_path):
+    code = cli.main(["annotate", "--config", "{}", "--renders", str(tmp_path), "--out", "x"])
+    assert code == cli.EXIT_USER_ERROR
+    assert capsys.readouterr().err.startswith("ntop annotate: ")

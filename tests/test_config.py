@@ -1,0 +1,112 @@
+import copy
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ntop.config import (
+    Actor,
+    Sequence,
+    check_tables,
+    read_config,
+    read_tsv,
+    stage_section,
+)
+from ntop.conventions import ConfigError
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = yaml.safe_load((ROOT / "config/config.yaml").read_text())
+
+
+def actor(split="train", name="a"):
+    return Actor(source="studio", actor=name, split=split)
+
+
+def sequence(use, action="walk", **more):
+    values = {"source": "studio", "actor": "a", "action": action, "first": 0, "last": 9} | more
+    return Sequence(use=use, **values)
+
+
+@pytest.mark.parametrize("name", ["config", "test", "studio"])
+def test_the_shipped_configurations_and_tables_are_valid(name):
+    merged = copy.deepcopy(SHIPPED)
+    for key, value in yaml.safe_load((ROOT / f"config/{name}.yaml").read_text()).items():
+        if isinstance(value, dict) and key in merged:
+            merged[key].update(value)
+        else:
+            merged[key] = value
+    config = read_config(merged)
+    actors = read_tsv(ROOT / config.actors, Actor)
+    sequences = read_tsv(ROOT / config.sequences, Sequence)
+    check_tables(config, actors, sequences)
+    assert actors
+    assert sequences
+
+
+def test_an_unknown_key_is_named_with_its_place():
+    broken = copy.deepcopy(SHIPPED)
+    broken["render"]["ring_radius"] = 1
+    with pytest.raises(ConfigError, match=r"render\.ring_radius: unknown key; check the spelling"):
+        read_config(broken)
+
+
+def test_a_retired_key_says_what_to_write_instead():
+    broken = copy.deepcopy(SHIPPED)
+    broken["render"]["heights_above_pelvis_m"] = [1.2]
+    with pytest.raises(ConfigError, match=r"use render\.rigs"):
+        read_config(broken)
+
+
+def test_an_unknown_reader_and_a_wrong_value_are_both_reported():
+    broken = copy.deepcopy(SHIPPED)
+    broken["sources"]["studio"]["reader"] = "holodeck"
+    broken["train"] = {"steps": 0}
+    with pytest.raises(ConfigError) as caught:
+        read_config(broken)
+    assert "holodeck" in str(caught.value)
+    assert "train.steps" in str(caught.value)
+
+
+def test_an_override_with_an_unknown_key_is_an_error():
+    broken = copy.deepcopy(SHIPPED)
+    broken["sources"]["studio"]["overrides"] = {"train": {"stepz": 3}}
+    config = read_config(broken)
+    with pytest.raises(ConfigError, match="stepz"):
+        stage_section(config, "train", source="studio")
+
+
+def test_a_source_hands_its_facts_to_its_stages_only():
+    config = read_config(SHIPPED)
+    assert stage_section(config, "train", source="balancing")["held_out_views"] == ["cam04"]
+    assert "held_out_views" not in stage_section(config, "train", source="studio")
+
+
+def test_an_actor_in_two_splits_is_an_error():
+    config = read_config(SHIPPED)
+    rows = [sequence("train"), sequence("render", action="sit")]
+    with pytest.raises(ConfigError, match=r"studio/a is listed twice \(split train and val\)"):
+        check_tables(config, [actor("train"), actor("val")], rows)
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([sequence("train")], "expected at least one"),
+        ([sequence("train"), sequence("render", last=0, first=3)], "lies before first"),
+        ([sequence("train"), sequence("render"), sequence("render")], "two lines"),
+        ([sequence("train"), sequence("render", actor="b")], "not in"),
+        ([sequence("train"), sequence("render", motion="authored:sit")], "another action name"),
+    ],
+)
+def test_tables_that_contradict_themselves_are_refused(rows, words):
+    with pytest.raises(ConfigError, match=words):
+        check_tables(read_config(SHIPPED), [actor()], rows)
+
+
+def test_a_broken_table_names_file_line_and_column(tmp_path):
+    path = tmp_path / "actors.tsv"
+    path.write_text("source\tactor\tsplit\nstudio\ta\ttest\n")
+    with pytest.raises(ConfigError, match=r"actors\.tsv line 2.*\n.*split"):
+        read_tsv(path, Actor)
+    with pytest.raises(ConfigError, match="cannot read table"):
+        read_tsv(tmp_path / "missing.tsv", Actor)

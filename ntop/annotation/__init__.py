@@ -1,0 +1,1 @@
+"""Labels of rendered views: keypoints, visibility, boxes, areas. Reads images, never the avatar."""

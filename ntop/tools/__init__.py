@@ -1,0 +1,1 @@
+"""Verbs beside the eight stages: fetching data, checking, planning."""

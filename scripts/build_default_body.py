@@ -27,6 +27,8 @@ NUM_SHAPES = 400  # of random adults for the shape space
 NUM_HELD_OUT = 60  # of further ones to check on
 ADULT_AGE = (2 / 3, 1.0)  # Anny's "young" and "old" anchors
 HEIGHT_MEAN, HEIGHT_SD = 0.38, 0.07  # about 1.72 m and 8 cm; uniform would span 1.2 to 2.5 m
+REGRESSOR_RADIUS_M = 0.35  # no vertex farther from a point takes part in regressing it
+REGRESSOR_ERROR_M = 0.001  # on the adults it is fitted to
 MAX_BONES = 4  # per vertex, as in SMPL
 TONGUE_VERTICES = 226  # the one closed component inside the head that nobody sees
 
@@ -173,23 +175,32 @@ def smpl_weights(model: anny.Anny) -> np.ndarray:
 def point_regressor(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Sparse non-negative weights, sum one, that place a point among nearby vertices.
 
-    Candidates lie in a sphere wide enough to surround the point with skin; non-negative least
-    squares over random shapes picks a few of them.
+    Candidates lie in a sphere around the point, as small as reproduces the point on random
+    adults; non-negative least squares picks a few of them.
     """
     random = np.random.default_rng(SEED)
     distance = np.linalg.norm(vertices - points[:, None], axis=-1).mean(0)
-    near = np.argsort(distance, kind="stable")
-    near = near[distance[near] < max(0.06, 2.5 * distance[near[0]])]
-    candidates = random.choice(near, size=min(400, len(near)), replace=False)
-    shapes = np.arange(0, NUM_SHAPES, 4)
-    # Relative to the point itself, so that the weights learn offsets and not stature.
-    rows = (vertices[shapes][:, candidates] - points[shapes, None]).transpose(0, 2, 1)
-    system = np.concatenate([rows.reshape(-1, len(candidates)), np.ones((1, len(candidates)))])
-    target = np.zeros(len(system))
-    target[-1] = 1.0
-    weights, _ = nnls(system, target)
-    regressor = np.zeros(vertices.shape[1])
-    regressor[candidates] = weights / weights.sum()
+    shapes = np.arange(0, NUM_SHAPES, 2)
+    radius = max(0.05, 1.5 * distance.min())
+    best = np.inf
+    while radius < REGRESSOR_RADIUS_M:
+        near = np.flatnonzero(distance < radius)
+        candidates = random.choice(near, size=min(800, len(near)), replace=False)
+        # Relative to the point itself, so that the weights learn offsets and not stature.
+        rows = (vertices[shapes][:, candidates] - points[shapes, None]).transpose(0, 2, 1)
+        system = np.concatenate([rows.reshape(-1, len(candidates)), np.ones((1, len(candidates)))])
+        target = np.zeros(len(system))
+        target[-1] = 1.0
+        weights, _ = nnls(system, target)
+        weights /= weights.sum()
+        worst = np.linalg.norm(rows @ weights, axis=-1).max()
+        if worst < 0.7 * best:  # a wider sphere must pay
+            best = worst
+            regressor = np.zeros(vertices.shape[1])
+            regressor[candidates] = weights
+        if best < REGRESSOR_ERROR_M:
+            break
+        radius *= 1.25
     return regressor
 
 

@@ -20,7 +20,7 @@ from ntop.config import explain
 from ntop.conventions import ConfigError, NtopError
 from ntop.stages import STAGES
 
-TOOLS = ("check", "fetch")
+TOOLS = ("fetch",)
 EXIT_USER_ERROR = 2
 
 

@@ -6,5 +6,7 @@ rule fetch:
         "logs/0_fetch/{package}.log",
     wildcard_constraints:
         package="[a-z0-9_]+",
+    conda:
+        "ntop"
     shell:
         "ntop fetch --name {wildcards.package} --out {output:q} 2> {log:q}"

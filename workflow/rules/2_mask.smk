@@ -1,12 +1,4 @@
 # frames -> person mattes and 2D keypoints
-def mask_packages(wildcards):
-    section = stage_section(CONFIG, "mask", source=wildcards.source)
-    needs_network = section.get("method", "mediapipe") == "mediapipe" or not given(
-        wildcards, "keypoints2d"
-    )
-    return package_folders(["mediapipe"] if needs_network else [])
-
-
 rule mask:
     input:
         capture=capture_folder,
@@ -17,6 +9,8 @@ rule mask:
         "logs/2_mask/{source}/{actor}.log",
     benchmark:
         "results/benchmarks/2_mask/{source}/{actor}.tsv"
+    conda:
+        "ntop"
     threads: 2
     resources:
         mem_mb=3000,

@@ -9,6 +9,8 @@ rule fit:
         "logs/3_fit/{source}/{actor}.log",
     benchmark:
         "results/benchmarks/3_fit/{source}/{actor}.tsv"
+    conda:
+        "ntop"
     threads: 2
     resources:
         mem_mb=4000,

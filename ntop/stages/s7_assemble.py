@@ -1,0 +1,215 @@
+"""Assemble: all shards -> one dataset folder: manifest, COCO and SMPL files, sets, card."""
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from itertools import groupby
+from pathlib import Path
+
+import ntop
+from ntop.config import Actor, AssembleConfig
+from ntop.conventions import VIEWS, ConfigError, DataError
+from ntop.metrics.statistics import Tally, statistics_rows, statistics_table
+from ntop.stages import STAGES
+from ntop.storage import schemas
+from ntop.storage.atomic import atomic_folder, write_bytes
+from ntop.storage.card import dataset_card
+from ntop.storage.coco import COCO17, SMPL24, CocoWriter, coco_writer
+from ntop.storage.links import link_or_copy
+from ntop.storage.manifest import ManifestWriter, manifest_writer
+from ntop.storage.provenance import code_sha256, json_sha256
+from ntop.storage.renders import IMAGE_FOLDERS, set_key
+from ntop.storage.sets import set_record, write_set
+from ntop.storage.tables import Row, read_table
+
+SPLITS = ("train", "val")
+COCO_NAMES = {COCO17: "person_keypoints", SMPL24: "person_smpl24"}
+NOT_IN_MANIFEST = ("coco17_world_m", "joints3d_world_m", *(n for n, _ in schemas.BODY_COLUMNS))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One shard's folder of renders and its table of annotations."""
+
+    renders: Path
+    annotations: Path
+
+
+@dataclass
+class Totals:
+    """What grows while shards are added; none of it with the number of images."""
+
+    tallies: dict[tuple[str, str], Tally] = field(default_factory=dict)
+    num_sets: int = 0
+
+
+def main(config: AssembleConfig, renders: list[Path], annotations: list[Path], out: Path) -> None:
+    """Build the dataset of all shards; `renders` and `annotations` are parallel lists.
+
+    Raises:
+        ConfigError: an actor is in two splits, or has none.
+        DataError: a shard and its annotations disagree, or the folder cannot be written.
+    """
+    actors = actors_by_key(config)
+    if len(renders) != len(annotations):
+        raise DataError(f"{len(renders)} shards and {len(annotations)} tables of annotations")
+    shards = [Shard(*pair) for pair in zip(renders, annotations, strict=True)]
+    totals = Totals()
+    with atomic_folder(out) as folder:
+        with ExitStack() as stack:
+            manifest = stack.enter_context(manifest_writer(folder))
+            coco = {
+                (skeleton.name, split): stack.enter_context(
+                    coco_writer(
+                        folder / "annotations" / f"{name}_{split}.json",
+                        skeleton=skeleton,
+                        info={"description": f"{config.dataset} {split}", "version": "1.0"},
+                    )
+                )
+                for skeleton, name in COCO_NAMES.items()
+                for split in SPLITS
+            }
+            for shard in in_order(shards):
+                add_shard(
+                    shard, actors=actors, folder=folder, manifest=manifest, coco=coco, totals=totals
+                )
+        write_summary(config, shards, totals=totals, folder=folder)
+
+
+def actors_by_key(config: AssembleConfig) -> dict[tuple[str, str], Actor]:
+    """The declared actors by (source, actor).
+
+    Raises:
+        ConfigError: an actor is in two splits.
+    """
+    actors: dict[tuple[str, str], Actor] = {}
+    for actor in config.actors:
+        known = actors.setdefault((actor.source, actor.actor), actor)
+        if known.split != actor.split:
+            raise ConfigError(
+                f"actor {actor.source}/{actor.actor} is in splits {known.split!r} and "
+                f"{actor.split!r}; an actor belongs to one: keep one line of the actors table"
+            )
+    return actors
+
+
+def in_order(shards: list[Shard]) -> list[Shard]:
+    """Shards by source, actor, action, rig and first frame, so that the manifest is sorted.
+
+    A shard without a usable frame adds no row and is left out.
+    """
+    keyed = []
+    for shard in shards:
+        rows = read_table(shard.renders / "renders.parquet", schema=schemas.RENDER)
+        if rows:
+            first = rows[0]
+            key = tuple(first[name] for name in ("source", "actor", "action", "rig", "frame"))
+            keyed.append((key, shard))
+    return [shard for _, shard in sorted(keyed, key=lambda pair: pair[0])]
+
+
+def add_shard(
+    shard: Shard,
+    *,
+    actors: dict[tuple[str, str], Actor],
+    folder: Path,
+    manifest: ManifestWriter,
+    coco: dict[tuple[str, str], CocoWriter],
+    totals: Totals,
+) -> None:
+    """Add a shard's sets to every file of the dataset."""
+    for pairs in sets_of(shard):
+        body = pairs[0][0]
+        actor = actors.get((body["source"], body["actor"]))
+        if actor is None:
+            raise ConfigError(
+                f"{shard.renders}: actor {body['source']}/{body['actor']} has no split; "
+                "add a line to the actors table"
+            )
+        rows = []
+        for render, annotated in pairs:
+            row = manifest_row(render, persons=annotated["persons"], split=actor.split)
+            for column in IMAGE_FOLDERS:
+                link_or_copy(shard.renders / render[column], folder / row[column])
+            manifest.add(row)
+            rows.append(row)
+            for skeleton, points in (
+                (COCO17, render["coco17_world_m"]),
+                (SMPL24, render["joints3d_world_m"]),
+            ):
+                coco[skeleton.name, actor.split].add(
+                    row, rle=annotated["rle"], keypoints3d_world_m=points
+                )
+            key = (actor.source, actor.split)
+            totals.tallies[key] = totals.tallies.get(key, Tally()).with_image(
+                (actor.source, actor.actor, actor.gender),
+                sizes_px=[tuple(person["bbox_xywh_px"][2:]) for person in row["persons"]],
+            )
+        write_set(set_record(rows, body=body), folder=folder)
+        totals.num_sets += 1
+
+
+def sets_of(shard: Shard) -> Iterator[list[tuple[Row, Row]]]:
+    """The sets of a shard: (render row, annotation row) of each view, in the rig's order.
+
+    Raises:
+        DataError: the two tables hold different samples.
+    """
+    renders = read_table(shard.renders / "renders.parquet", schema=schemas.RENDER)
+    annotated = {
+        row["sample_id"]: row for row in read_table(shard.annotations, schema=schemas.KEYPOINTS)
+    }
+    if set(annotated) != {row["sample_id"] for row in renders}:
+        raise DataError(
+            f"{shard.annotations} annotates other samples than {shard.renders} holds; "
+            "rerun the annotate stage for this shard"
+        )
+    for _, group in groupby(renders, key=set_key):
+        views = sorted(group, key=lambda row: VIEWS.index(row["view"]))
+        yield [(row, annotated[row["sample_id"]]) for row in views]
+
+
+def manifest_row(render: Row, *, persons: list[Row], split: str) -> Row:
+    """The manifest's row of one view; paths become relative to the dataset's folder."""
+    key = set_key(render)
+    place = f"{split}/{key.folder()}/{key.image_name(render['view'])}"
+    kept = {name: value for name, value in render.items() if name not in NOT_IN_MANIFEST}
+    paths = {column: f"{kind}/{place}" for column, kind in IMAGE_FOLDERS.items()}
+    return kept | paths | {"split": split, "persons": persons}
+
+
+def write_summary(
+    config: AssembleConfig, shards: list[Shard], *, totals: Totals, folder: Path
+) -> None:
+    """Write `dataset.json` and the dataset card."""
+    lines = statistics_rows(totals.tallies, dataset=config.dataset)
+    num_images = lines[-1].images
+    skipped = [
+        frame
+        for shard in shards
+        for frame in json.loads((shard.renders / "skipped.json").read_text())
+    ]
+    values = config.model_dump(mode="json")
+    summary = {
+        "dataset": config.dataset,
+        "ntop_version": ntop.__version__,
+        "stage_versions": {name: version for _, name, version in STAGES},
+        "config": values,
+        "config_sha256": json_sha256(values),
+        "code_sha256": code_sha256(),
+        "num_images": num_images,
+        "num_sets": totals.num_sets,
+        "statistics": [asdict(line) for line in lines],
+        "skipped": sorted(skipped, key=lambda item: json.dumps(item, sort_keys=True)),
+    }
+    text = json.dumps(summary, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    write_bytes(folder / "dataset.json", text.encode())
+    card = dataset_card(
+        dataset=config.dataset,
+        version=ntop.__version__,
+        num_images=num_images,
+        num_sets=totals.num_sets,
+        statistics=statistics_table(lines),
+    )
+    write_bytes(folder / "README.md", card.encode())

@@ -1,0 +1,76 @@
+"""The dataset card: a README with Hugging Face's YAML header."""
+
+SIZE_CATEGORIES = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+)
+
+TEMPLATE = """---
+pretty_name: {dataset}
+license: other
+task_categories:
+- keypoint-detection
+- image-segmentation
+- depth-estimation
+tags:
+- synthetic
+- fisheye
+- top-view
+- human-pose-estimation
+- smpl
+size_categories:
+- {size_category}
+---
+
+# {dataset}
+
+Virtual top-view fisheye images of people with masks, depth, part labels, 2D and 3D keypoints with
+occlusion-true visibility, SMPL parameters and cameras. {num_images} images in {num_sets} sets of
+nine views (`centre` and eight on a circle around it); made by ntop {version}.
+
+{statistics}
+
+Actors are unique persons, subjects are rendered human instances; the size is that of the tight box
+around the mask, in pixels (width×height). Splits are by actor: nobody is in both.
+
+## Files
+
+| path | content |
+|:--|:--|
+| `manifest.parquet` | one row per image: camera, files, persons with keypoints and SMPL |
+| `images/`, `depth/`, `parts/` | RGBA; 16-bit ray length; 8-bit part labels |
+| `annotations/person_keypoints_{{train,val}}.json` | COCO-17 keypoints, boxes, RLE masks |
+| `annotations/person_smpl24_{{train,val}}.json` | the 24 SMPL joints in COCO's format |
+| `sets/` | one JSON per body pose: SMPL parameters, 3D keypoints, its virtual cameras and views |
+| `dataset.json` | versions, hashes, these statistics, unusable frames with their reasons |
+
+## Conventions
+
+- World: right-handed, metres, +z up. Camera: x right, y down, z forward,
+  `X_camera = R (X_world - center_world_m)`, `rotation_camera_from_world` row by row.
+- Lens: equidistant fisheye, `rho = focal_px * theta` up to `max_theta_rad`.
+- Pixels are continuous: the first pixel's centre is (0.5, 0.5). The `keypoints` of the COCO files
+  alone follow COCO (first centre at 0): ours minus 0.5.
+- Images: sRGB, straight alpha; the person's mask is alpha >= 128.
+- Depth: 0.1 mm of *ray length* per step, 0 where there is nothing. Parts: SMPL bone + 1.
+- Visibility: 0 outside the image circle, 1 occluded, 2 visible; 2D coordinates are kept unclipped,
+  except in COCO's `keypoints`, where v = 0 comes with x = y = 0.
+- SMPL-24 has no standard OKS sigmas: those used are in each file's category record.
+"""
+
+
+def dataset_card(
+    *, dataset: str, version: str, num_images: int, num_sets: int, statistics: str
+) -> str:
+    """The text of a dataset's README.md; `statistics` is a Markdown table."""
+    size_category = next((name for limit, name in SIZE_CATEGORIES if num_images < limit), "n>1M")
+    return TEMPLATE.format(
+        dataset=dataset,
+        version=version,
+        num_images=f"{num_images:,}",
+        num_sets=f"{num_sets:,}",
+        statistics=statistics,
+        size_category=size_category,
+    )

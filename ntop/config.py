@@ -155,7 +155,19 @@ class MaskConfig(Section):
 
     method: Literal["mediapipe", "background"] = "mediapipe"
     provides: tuple[Given, ...] = ()
-    overrides: str = Field(default="", description="Folder of hand-corrected masks; empty: none.")
+    overrides: str = Field(
+        default="",
+        description="Folder of hand-corrected mattes `{action}/{view}/{frame:06d}.png`; "
+        "empty: none.",
+    )
+    detector: str = Field(
+        default="mediapipe-0.10.21/mediapipe/modules/pose_detection/pose_detection.tflite",
+        description="Pose detector, below the package folder.",
+    )
+    landmarks: str = Field(
+        default="mediapipe-0.10.21/mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
+        description="Pose landmark network, below the package folder; the heavy one fits as well.",
+    )
 
 
 class FitConfig(Section):

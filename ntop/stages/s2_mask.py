@@ -1,0 +1,202 @@
+"""Stage mask: frames -> soft person mattes and 2D keypoints with confidence.
+
+| written below `out` | what |
+|---|---|
+| `masks.parquet` (schema MASK) | per frame and view: path, confidence in [0, 1], method, reason |
+| `masks/{action}/{view}/{frame}.png` | 8-bit soft matte, as large as the frame |
+| `keypoints2d.parquet` (KEYPOINTS2D) | 33 MediaPipe keypoints in our continuous pixels |
+
+What the source provides is not computed again: with its own keypoints only masks are written, with
+its own masks only keypoints. A frame without a usable person becomes an empty matte, keypoints of
+confidence 0, and a row with the reason.
+"""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from ntop.config import MaskConfig
+from ntop.conventions import DataError
+from ntop.masks.background import temporal_median
+from ntop.masks.landmarks import NUM_KEYPOINTS
+from ntop.masks.network import Network
+from ntop.masks.segmentation import (
+    Segmentation,
+    has_person,
+    segment_difference,
+    segment_person,
+)
+from ntop.masks.tracking import Networks, Sighting, follow_person
+from ntop.storage import schemas
+from ntop.storage.frames import iterate_frames
+from ntop.storage.images import read_matte, write_matte
+from ntop.storage.tables import Row, read_table, write_table
+
+Picture = UInt8[np.ndarray, "height width 3"]
+
+SKELETON = "mediapipe33"
+KEY = ("source", "actor", "action", "frame", "view")
+MEDIAN_FRAMES = 25  # of a view, evenly spread, for a plate by temporal median
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the stage must do, and where the files lie."""
+
+    config: MaskConfig
+    capture: Path
+    packages: Path
+    out: Path
+
+    @property
+    def wants_masks(self) -> bool:
+        """Whether the source leaves the masks to this stage."""
+        return "masks" not in self.config.provides
+
+    @property
+    def wants_keypoints(self) -> bool:
+        """Whether the source leaves the keypoints to this stage."""
+        return "keypoints2d" not in self.config.provides
+
+
+def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
+    """Segment the actor and find his keypoints in every frame of a capture.
+
+    Args:
+        config: method, networks, folder of hand-corrected masks, what the source provides.
+        capture: folder of the capture stage: `frames.parquet`, pictures, optionally `plates/`.
+        packages: folder of fetched packages with the networks.
+        out: folder to write.
+
+    Raises:
+        DataError: unreadable frames or networks, a hand-corrected mask of another size than its
+            frame, or not one frame of the actor with a usable mask, or with keypoints.
+    """
+    job = Job(config, capture, packages, out)
+    table = read_table(capture / "frames.parquet", schema=schemas.FRAME)
+    rows = sorted(table, key=lambda row: (row["action"], row["view"], row["frame"]))
+    views = [list(g) for _, g in groupby(rows, key=lambda row: (row["action"], row["view"]))]
+    # One thread per core: networks and OpenCV compute outside Python's lock, and what comes out
+    # of a view does not depend on the other views.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        done = [pair for part in pool.map(lambda view: process_view(job, view), views)
+                for pair in part]  # fmt: skip
+    if job.wants_masks:
+        masks = [mask for mask, _ in done]
+        if all(mask["confidence"] == 0 for mask in masks):
+            raise DataError(_nothing_usable(capture, "mask", [m["reason"] for m in masks]))
+        write_table(masks, schema=schemas.MASK, path=out / "masks.parquet")
+    if job.wants_keypoints:
+        points = [point for _, point in done]
+        if not any(any(point["confidence"]) for point in points):
+            raise DataError(_nothing_usable(capture, "keypoint", [m["reason"] for m, _ in done]))
+        write_table(points, schema=schemas.KEYPOINTS2D, path=out / "keypoints2d.parquet")
+
+
+def process_view(job: Job, rows: list[Row]) -> list[tuple[Row, Row]]:
+    """Mask and keypoint row of every frame of one view, followed in time; writes the mattes."""
+    usable = [row for row in rows if not row["reason"]]
+    networks = _load_networks(job)
+    by_plate = job.wants_masks and job.config.method == "background" and usable
+    plate = _read_plate(job, usable) if by_plate else None
+    results, last = [], None
+    for row, image in _in_time(job, usable):
+        sighting = follow_person(networks, image, last) if networks else Sighting(None, "")
+        last = sighting.pose.next_region if sighting.pose else last
+        if plate is None:
+            found = segment_person(image, sighting)
+        else:
+            found = segment_difference(image, plate)
+        results.append((_mask_row(job, row, found), _keypoint_row(row, sighting)))
+    for row in rows:
+        if row["reason"]:
+            empty = np.zeros((row["height"], row["width"]), np.float32)
+            found = Segmentation(empty, 0.0, row["reason"])
+            results.append((_mask_row(job, row, found), _keypoint_row(row, Sighting(None, ""))))
+    return results
+
+
+def _load_networks(job: Job) -> Networks | None:
+    """The pose networks, one pair per view (an interpreter is not thread-safe), if needed."""
+    if not job.wants_keypoints and job.config.method != "mediapipe":
+        return None
+    detector, landmarks = job.config.detector, job.config.landmarks
+    return Networks(Network(job.packages / detector), Network(job.packages / landmarks))
+
+
+def _in_time(job: Job, rows: list[Row]) -> Iterator[tuple[Row, Picture]]:
+    return iterate_frames(job.capture / "frames.parquet", rows)
+
+
+def _read_plate(job: Job, rows: list[Row]) -> Picture:
+    """The empty scene of a view: the capture's plate if it has one, else the median over time."""
+    path = job.capture / "plates" / f"{rows[0]['action']}_{rows[0]['view']}.png"
+    if not path.exists():
+        chosen = rows[:: max(1, len(rows) // MEDIAN_FRAMES)]
+        return temporal_median([image for _, image in _in_time(job, chosen)])
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    size = (rows[0]["height"], rows[0]["width"])
+    if bgr is None or bgr.shape[:2] != size:
+        got = "no readable picture" if bgr is None else f"{bgr.shape[1]}x{bgr.shape[0]} px"
+        raise DataError(
+            f"background plate {path}: {got}, expected {size[1]}x{size[0]} px as the frames; "
+            "rerun the capture stage"
+        )
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _mask_row(job: Job, row: Row, found: Segmentation) -> Row:
+    """The row of a frame's matte, computed or corrected by hand; writes it if masks are wanted."""
+    name = f"{row['action']}/{row['view']}/{row['frame']:06d}.png"
+    method = job.config.method
+    corrected = Path(job.config.overrides) / name if job.config.overrides else None
+    if corrected is not None and corrected.exists():
+        found, method = _read_override(corrected, row), "manual"
+    if job.wants_masks:
+        write_matte(found.matte, path=job.out / "masks" / name)
+    return {key: row[key] for key in KEY} | {
+        "mask_path": f"masks/{name}",
+        "confidence": found.confidence,
+        "method": method,
+        "reason": found.reason,
+    }
+
+
+def _read_override(path: Path, row: Row) -> Segmentation:
+    matte = read_matte(path)
+    height, width = matte.shape
+    if (width, height) != (row["width"], row["height"]):
+        raise DataError(
+            f"hand-corrected mask {path} is {width}x{height} px, its frame "
+            f"{row['width']}x{row['height']} px; save it in the frame's size"
+        )
+    if has_person(matte):
+        return Segmentation(matte, 1.0, "")
+    return Segmentation(matte, 0.0, "empty mask, by hand")
+
+
+def _keypoint_row(row: Row, sighting: Sighting) -> Row:
+    pose = sighting.pose
+    points = np.zeros((NUM_KEYPOINTS, 2)) if pose is None else pose.keypoints_px
+    confidence = np.zeros(NUM_KEYPOINTS) if pose is None else pose.confidence
+    return {key: row[key] for key in KEY} | {
+        "skeleton": SKELETON,
+        "keypoints_px": points.ravel().tolist(),
+        "confidence": confidence.tolist(),
+    }
+
+
+def _nothing_usable(capture: Path, what: str, reasons: list[str]) -> str:
+    examples = "; ".join(sorted(set(reasons))[:3])
+    return (
+        f"{capture}: not one of {len(reasons)} frames has a usable {what} ({examples}); look at "
+        "the pictures, choose another `mask.method`, or give hand-corrected masks in "
+        "`mask.overrides`"
+    )

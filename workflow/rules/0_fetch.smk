@@ -9,4 +9,4 @@ rule fetch:
     conda:
         "ntop"
     shell:
-        "ntop fetch --name {wildcards.package} --out {output:q} 2> {log:q}"
+        "exec ntop fetch --name {wildcards.package} --out {output:q} 2> {log:q}"

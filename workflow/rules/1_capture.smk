@@ -16,5 +16,5 @@ rule capture:
         config=capture_params,
         packages=PACKAGES,
     shell:
-        "ntop capture --config {params.config:q} --source {wildcards.source}"
+        "exec ntop capture --config {params.config:q} --source {wildcards.source}"
         " --actor {wildcards.actor} --packages {params.packages:q} --out {output:q} 2> {log:q}"

@@ -18,5 +18,5 @@ rule mask:
         config=stage_params("mask"),
         packages=PACKAGES,
     shell:
-        "ntop mask --config {params.config:q} --capture {input.capture:q}"
+        "exec ntop mask --config {params.config:q} --capture {input.capture:q}"
         " --packages {params.packages:q} --out {output:q} 2> {log:q}"

@@ -17,5 +17,5 @@ rule fit:
     params:
         config=stage_params("fit"),
     shell:
-        "ntop fit --config {params.config:q} --capture {input.capture:q}"
+        "exec ntop fit --config {params.config:q} --capture {input.capture:q}"
         " --masks {input.masks:q} --out {output:q} 2> {log:q}"

@@ -15,5 +15,5 @@ rule annotate:
     params:
         config=stage_params("annotate"),
     shell:
-        "ntop annotate --config {params.config:q} --renders {input.renders:q}"
+        "exec ntop annotate --config {params.config:q} --renders {input.renders:q}"
         " --out {output:q} 2> {log:q}"

@@ -16,5 +16,5 @@ rule assemble:
     params:
         config=assemble_params,
     shell:
-        "ntop assemble --config {params.config:q} --renders {input.renders:q}"
+        "exec ntop assemble --config {params.config:q} --renders {input.renders:q}"
         " --annotations {input.annotations:q} --out {output:q} 2> {log:q}"

@@ -21,7 +21,7 @@ rule evaluate:
         config=stage_params("evaluate"),
         benchmarks="results/benchmarks",
     shell:
-        "ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
+        "exec ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
         " --captures {input.captures:q} --mattes {input.mattes:q} --bodies {input.bodies:q}"
         " --avatars {input.avatars:q} --benchmarks {params.benchmarks:q}"
         " --out {output:q} 2> {log:q}"

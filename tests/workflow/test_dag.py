@@ -1,0 +1,106 @@
+"""What Snakemake plans, without running a stage."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.workflow.project import ROOT, TEST_CONFIG
+
+
+def planned(text: str) -> dict[str, int]:
+    """Rule -> number of jobs, from the table of a dry run."""
+    return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", text, re.MULTILINE)}
+
+
+def test_a_plain_call_finds_the_default_profile_and_plans_the_demo(project):
+    done = project.snakemake("-n", "--quiet", "rules")
+    assert done.returncode == 0, done.stderr
+    assert "profiles/default" in done.stdout + done.stderr
+    jobs = planned(done.stdout + done.stderr)
+    assert (jobs["capture"], jobs["mask"], jobs["fit"], jobs["train"]) == (2, 1, 1, 2)
+    assert jobs["render"] == jobs["annotate"] > 2
+    assert (jobs["assemble"], jobs["evaluate"]) == (1, 1)
+
+
+def test_what_a_source_brings_along_is_not_in_the_plan(project):
+    done = project.snakemake("-n", "-p", *TEST_CONFIG)
+    assert done.returncode == 0, done.stderr
+    assert "results/2_mask/raw/loose" in done.stdout
+    assert "results/2_mask/studio/plain" not in done.stdout
+    assert "results/3_fit/studio/plain" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train={'stepz': 3}"], "train.stepz: unknown key; check the spelling"),
+        (["heights_above_pelvis_m=[1.2]"], "use render.rigs"),
+    ],
+)
+def test_a_wrong_key_stops_at_once_with_advice(project, words, message):
+    done = project.snakemake("-n", "--config", *words)
+    assert done.returncode != 0
+    assert message in done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_an_actor_in_two_splits_stops_at_once(project):
+    with (project.folder / "config/actors.tsv").open("a") as table:
+        table.write("studio\tplain\ttrain\tm\n")
+    done = project.snakemake("-n")
+    assert done.returncode != 0
+    assert "studio/plain is listed twice" in done.stdout + done.stderr
+
+
+def test_a_new_actor_adds_its_own_jobs_only(project):
+    before = planned(project.snakemake("-n", "--quiet", "rules", *TEST_CONFIG).stdout)
+    with (project.folder / "config/test/actors.tsv").open("a") as table:
+        table.write("studio\tloose\ttrain\tf\n")
+    with (project.folder / "config/test/sequences.tsv").open("a") as table:
+        table.write("studio\tloose\trange\t0\t50\t25\ttrain\tauthored:range\t-\n")
+        table.write("studio\tloose\tsit\t0\t20\t20\trender\tauthored:sit\t-\n")
+    after = planned(project.snakemake("-n", "--quiet", "rules", *TEST_CONFIG).stdout)
+    added = {name: after[name] - before[name] for name in after if after[name] != before[name]}
+    assert {k: v for k, v in added.items() if k != "total"} == {
+        "capture": 1, "train": 1, "render": 2, "annotate": 2,
+    }  # fmt: skip
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("campaign")
+class TestAfterTheCampaign:
+    def test_a_second_run_does_nothing_and_says_so(self, campaign):
+        done = campaign.run()
+        assert done.returncode == 0, done.stderr
+        assert "Nothing to be done" in done.stdout + done.stderr
+
+    @pytest.mark.parametrize(
+        ("change", "expected"),
+        [
+            ("train={'steps': 151}", {"train", "render", "annotate", "assemble", "evaluate"}),
+            ("render={'seed': 5}", {"render", "annotate", "assemble", "evaluate"}),
+        ],
+    )
+    def test_a_changed_value_reruns_its_stage_and_nothing_upstream(
+        self, campaign, change, expected
+    ):
+        done = campaign.snakemake("-n", "--quiet", "rules", *TEST_CONFIG, "--config", change)
+        assert set(planned(done.stdout)) - {"all", "total"} == expected, done.stderr
+
+    def test_a_bumped_version_reruns_its_stage_and_nothing_upstream(self, campaign, tmp_path):
+        package = tmp_path / "ntop"
+        shutil.copytree(ROOT / "ntop", package, ignore=shutil.ignore_patterns("__pycache__"))
+        stages = package / "stages/__init__.py"
+        stages.write_text(stages.read_text().replace('(6, "annotate", 1)', '(6, "annotate", 99)'))
+        done = campaign.snakemake("-n", "--quiet", "rules", *TEST_CONFIG, PYTHONPATH=str(tmp_path))
+        assert set(planned(done.stdout)) - {"all", "total"} == {"annotate", "assemble", "evaluate"}
+
+    def test_every_job_left_a_log_and_a_benchmark(self, campaign):
+        logs = {p.relative_to(campaign.folder / "logs").with_suffix("")
+                for p in (campaign.folder / "logs").rglob("*.log")}  # fmt: skip
+        times = {p.relative_to(campaign.folder / "results/benchmarks").with_suffix("")
+                 for p in (campaign.folder / "results/benchmarks").rglob("*.tsv")}  # fmt: skip
+        assert Path("4_train/raw/loose") in times
+        assert {p for p in logs if p.parts[0] != "0_fetch"} == times

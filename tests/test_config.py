@@ -1,4 +1,5 @@
 import copy
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -110,3 +111,13 @@ def test_a_broken_table_names_file_line_and_column(tmp_path):
         read_tsv(path, Actor)
     with pytest.raises(ConfigError, match="cannot read table"):
         read_tsv(tmp_path / "missing.tsv", Actor)
+
+
+def test_the_page_of_all_keys_is_in_step_with_the_models():
+    path = ROOT / "scripts/write_config_reference.py"
+    spec = importlib.util.spec_from_file_location("write_config_reference", path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    assert (ROOT / "config/README.md").read_text() == script.reference(), (
+        "run: python scripts/write_config_reference.py"
+    )

@@ -1,0 +1,1 @@
+"""What a finished dataset is worth: scores against truth, and one HTML page that shows them."""

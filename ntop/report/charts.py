@@ -1,0 +1,123 @@
+"""Line and bar charts as inline SVG, coloured by the page's style sheet (light and dark)."""
+
+import html
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+WIDTH, HEIGHT = 640, 300
+LEFT, RIGHT, TOP, BOTTOM = 62, 16, 18, 44
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve; `kind` selects its colour and dashes (0, 1, 2, ...)."""
+
+    name: str
+    x: list[float]
+    y: list[float]
+    kind: int = 0
+    dots: bool = False
+
+
+def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> str:
+    """Curves over a common x axis; non-finite values are left out."""
+    finite = [
+        [(x, y) for x, y in zip(line.x, line.y, strict=True) if math.isfinite(y)] for line in lines
+    ]
+    values = [point for points in finite for point in points]
+    if not values:
+        return ""
+    x_ticks = _ticks(min(v[0] for v in values), max(v[0] for v in values))
+    y_ticks = _ticks(min(v[1] for v in values), max(v[1] for v in values))
+    x_span, y_span = (x_ticks[0], x_ticks[-1]), (y_ticks[0], y_ticks[-1])
+
+    def at(point: tuple[float, float]) -> tuple[float, float]:
+        x = LEFT + (point[0] - x_span[0]) / (x_span[1] - x_span[0]) * (WIDTH - LEFT - RIGHT)
+        share = (point[1] - y_span[0]) / (y_span[1] - y_span[0])
+        return x, HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM)
+
+    parts = []
+    for tick in x_ticks:
+        x, _ = at((tick, y_span[0]))
+        y = HEIGHT - BOTTOM + 18
+        parts.append(f'<text x="{x:.1f}" y="{y}" class="tick mid">{tick:g}</text>')
+    for tick in y_ticks:
+        _, y = at((x_span[0], tick))
+        parts.append(
+            f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text x="{LEFT - 8}" y="{y + 4:.1f}" class="tick end">{tick:g}</text>'
+        )
+    for line, points in zip(lines, finite, strict=True):
+        placed = [at(p) for p in points]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in placed)
+        if line.dots:
+            parts += [
+                f'<circle class="dot k{line.kind}" cx="{x:.1f}" cy="{y:.1f}" r="4"/>'
+                for x, y in placed
+            ]
+        else:
+            parts.append(f'<polyline class="curve k{line.kind}" points="{path}"/>')
+    x_middle, y_middle = (LEFT + WIDTH - RIGHT) / 2, (TOP + HEIGHT - BOTTOM) / 2
+    parts.append(f'<text x="{x_middle}" y="{HEIGHT - 6}" class="axis mid">{_safe(x_label)}</text>')
+    parts.append(
+        f'<text transform="translate(14 {y_middle}) rotate(-90)" class="axis mid">'
+        f"{_safe(y_label)}</text>"
+    )
+    legend = "".join(f'<span class="key k{line.kind}">{_safe(line.name)}</span>' for line in lines)
+    return (
+        f'<figure class="chart"><svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
+        f'aria-label="{_safe(title)}">{"".join(parts)}</svg>'
+        f"<figcaption>{_safe(title)} <span class=keys>{legend}</span></figcaption></figure>"
+    )
+
+
+def bar_chart(values: dict[str, float | None], *, title: str, unit: str) -> str:
+    """Horizontal bars, one per entry, each with its number; a missing value says so."""
+    row, label_width = 30, 110
+    height = row * len(values) + 8
+    largest = max((v for v in values.values() if v is not None), default=0.0) or 1.0
+    parts = []
+    for index, (name, value) in enumerate(values.items()):
+        y = 4 + index * row
+        place = f'x="{label_width - 10}" y="{y + 19}"'
+        parts.append(f'<text {place} class="axis end">{_safe(name)}</text>')
+        length = 0.0 if value is None else value / largest * (WIDTH - label_width - 110)
+        shown = "not measured" if value is None else f"{human(value)} {unit}"
+        parts.append(
+            f'<rect class="bar" x="{label_width}" y="{y + 4}" width="{max(length, 1):.1f}" '
+            f'height="{row - 10}" rx="3"/>'
+            f'<text x="{label_width + length + 8:.1f}" y="{y + 19}" class="tick">{shown}</text>'
+        )
+    return (
+        f'<figure class="chart"><svg viewBox="0 0 {WIDTH} {height}" role="img" '
+        f'aria-label="{_safe(title)}">{"".join(parts)}</svg>'
+        f"<figcaption>{_safe(title)}</figcaption></figure>"
+    )
+
+
+def human(value: float) -> str:
+    """A number with three significant digits, without exponent where a person would use none."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    if abs(value) < 1e-3:
+        return f"{value:.1e}"
+    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers that span the range: 1, 2 or 5 times a power of ten apart."""
+    if high - low < 1e-12:
+        low, high = low - 0.5, high + 0.5
+    raw = (high - low) / 5
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= raw)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [float(np.round(i * step, 12)) for i in range(first, last + 1)]
+
+
+def _safe(text: str) -> str:
+    return html.escape(text, quote=True)

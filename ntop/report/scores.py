@@ -1,0 +1,67 @@
+"""Scores of cut-outs against references: one record per picture, means, and which to show."""
+
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+
+from ntop.metrics.images import Cutout, mask_iou, psnr_box_db, psnr_person_db, ssim_box
+from ntop.report.page import Table
+
+
+@dataclass(frozen=True)
+class ImageScores:
+    """One rendered picture against its reference."""
+
+    psnr_person_db: float
+    psnr_box_db: float
+    ssim_box: float
+    mask_iou: float
+    baseline_psnr_person_db: float
+    baseline_psnr_box_db: float
+
+
+def score_image(image: Cutout, reference: Cutout, *, baseline: Cutout) -> ImageScores:
+    """All image scores, the painted body's included."""
+    return ImageScores(
+        psnr_person_db=psnr_person_db(image, reference),
+        psnr_box_db=psnr_box_db(image, reference),
+        ssim_box=ssim_box(image, reference),
+        mask_iou=mask_iou(image.mask, reference.mask),
+        baseline_psnr_person_db=psnr_person_db(baseline, reference),
+        baseline_psnr_box_db=psnr_box_db(baseline, reference),
+    )
+
+
+def mean_scores(scores: list[ImageScores]) -> ImageScores:
+    """The mean of every score over the pictures (decibels are averaged, not errors)."""
+    return ImageScores(*np.mean([astuple(s) for s in scores], axis=0).tolist())
+
+
+def best_median_worst(scores: list[ImageScores]) -> dict[str, int]:
+    """Which pictures to show, by `psnr_box_db`; fewer than three pictures give fewer names."""
+    order = sorted(range(len(scores)), key=lambda index: -scores[index].psnr_box_db)
+    shown = {order[-1]: "worst", order[len(order) // 2]: "median", order[0]: "best"}
+    return {shown[index]: index for index in order if index in shown}
+
+
+def score_table(groups: dict[str, list[ImageScores]], *, first: str) -> Table:
+    """Mean scores per group and over all pictures."""
+    head = (
+        first, "pictures", "PSNR person (dB)", "PSNR box (dB)", "SSIM box", "mask IoU",
+        "painted body: person (dB)", "painted body: box (dB)",
+    )  # fmt: skip
+    everything = [score for scores in groups.values() for score in scores]
+    rows = [_row(name, scores) for name, scores in groups.items()]
+    if len(groups) > 1:
+        rows.append(_row("all", everything))
+    return Table(head, tuple(rows), total=len(groups) > 1)
+
+
+def _row(name: str, scores: list[ImageScores]) -> tuple[str, ...]:
+    mean = mean_scores(scores)
+    digits = {"ssim_box": 3, "mask_iou": 3}
+    return (
+        name,
+        str(len(scores)),
+        *(f"{getattr(mean, f.name):.{digits.get(f.name, 2)}f}" for f in fields(mean)),
+    )

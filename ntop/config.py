@@ -161,11 +161,11 @@ class MaskConfig(Section):
         "empty: none.",
     )
     detector: str = Field(
-        default="mediapipe-0.10.21/mediapipe/modules/pose_detection/pose_detection.tflite",
+        default="mediapipe/pose_detection/pose_detection.tflite",
         description="Pose detector, below the package folder.",
     )
     landmarks: str = Field(
-        default="mediapipe-0.10.21/mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
+        default="mediapipe/pose_landmark/pose_landmark_full.tflite",
         description="Pose landmark network, below the package folder; the heavy one fits as well.",
     )
 

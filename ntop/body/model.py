@@ -6,8 +6,9 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from ntop.body.smpl_files import read_smpl_arrays
 from torch import Tensor
+
+from ntop.body.smpl_files import read_smpl_arrays
 
 EMBEDDED_BODY_PATH = Path(__file__).parent / "data" / "default_body.npz"
 

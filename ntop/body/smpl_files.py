@@ -173,22 +173,24 @@ class _Attributes:
         self.__dict__.update(state)
 
 
+# numpy's own constructors, whatever numpy wrote the file
+_NUMPY_GLOBALS = {
+    ("multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
+    ("multiarray", "scalar"): np.float64(0).__reduce__()[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+}
+
+
 class _ArrayUnpickler(pickle.Unpickler):
     """Builds arrays and plain holders; any other global in the file is refused."""
-
-    _NUMPY = {
-        ("multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
-        ("multiarray", "scalar"): np.float64(0).__reduce__()[0],
-        ("numpy", "ndarray"): np.ndarray,
-        ("numpy", "dtype"): np.dtype,
-    }
 
     def find_class(self, module: str, name: str) -> object:
         package, _, last = module.rpartition(".")
         if module.split(".")[0] == "chumpy" or name in ("csc_matrix", "csc_array"):
             return _Attributes
-        if package in ("", "numpy.core", "numpy._core") and (last, name) in self._NUMPY:
-            return self._NUMPY[last, name]
+        if package in ("", "numpy.core", "numpy._core") and (last, name) in _NUMPY_GLOBALS:
+            return _NUMPY_GLOBALS[last, name]
         if (module, name) == ("_codecs", "encode"):  # how protocol 2 spells bytes
             return super().find_class(module, name)
         raise DataError(f"refused to load {module}.{name}: not an array constructor; {_REMEDY}")
@@ -204,7 +206,7 @@ def _unpickle(file: IO[bytes], path: Path) -> object:
 
 
 def _read_pickle(path: Path) -> dict:
-    with open(path, "rb") as file:
+    with path.open("rb") as file:
         content = _unpickle(file, path)
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a {type(content).__name__}, expected a dict; {_REMEDY}")

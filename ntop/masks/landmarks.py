@@ -5,14 +5,15 @@ them (64 x 64) correct them by the centre of mass around each (MediaPipe's
 RefineLandmarksFromHeatmap; without it the points miss by 9-12 px in a 1080 x 1920 image).
 
 One look errs by a few pixels at random. The region turned a little and mirrored gives other errors,
-so `estimate_pose` averages six looks.
+so `estimate_pose` averages those of six looks that agree.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
+from ntop.masks.consensus import MIRRORED, agree
 from ntop.masks.network import Network
 from ntop.masks.regions import Region, crop_region, region_of_person, transform_points, warp_back
 
@@ -23,11 +24,6 @@ LANDMARKS_SHAPE, FLAG_SHAPE = (1, 5 * NUM_LANDMARKS), (1, 1)
 MASK_SHAPE, HEATMAP_SHAPE = (1, SIZE, SIZE, 1), (1, 64, 64, NUM_LANDMARKS)
 HEATMAP_KERNEL = 7
 MIN_HEATMAP_CONFIDENCE = 0.5
-# left <-> right of the keypoints and the two circle landmarks
-MIRRORED = (
-    0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17, 20, 19, 22, 21, 24, 23,
-    26, 25, 28, 27, 30, 29, 32, 31, 33, 34,
-)  # fmt: skip
 TURNS_RAD = (-0.25, 0.0, 0.25)  # rotations of the region, each seen plain and mirrored
 
 
@@ -49,13 +45,16 @@ class Look:
 class Pose:
     """The person in a region, averaged over several looks.
 
+    `landmarks_px` are the 33 keypoints and the two points of his circle. `votes` says per group
+    (head, arms, legs) how many more looks named left and right as here than the other way round;
     `person` is the probability image in the frame's pixels, `agreement` the mean intersection over
     union of the looks' masks with theirs together, `next_region` where he is now.
     """
 
     region: Region
-    keypoints_px: Float[np.ndarray, "33 2"]
-    confidence: Float[np.ndarray, " 33"]
+    landmarks_px: Float[np.ndarray, "35 2"]
+    confidence: Float[np.ndarray, " 35"]
+    votes: Int[np.ndarray, " 3"]
     pose_score: float
     person: Float32[np.ndarray, "height width"]
     agreement: float
@@ -119,9 +118,16 @@ def locate_person(
 
 
 def estimate_pose(
-    network: Network, image: UInt8[np.ndarray, "height width 3"], region: Region
+    network: Network,
+    image: UInt8[np.ndarray, "height width 3"],
+    region: Region,
+    *,
+    before_px: Float[np.ndarray, "35 2"] | None,
 ) -> Pose:
-    """Keypoints and soft mask of the person in `region` of an RGB image."""
+    """Keypoints and soft mask of the person in `region` of an RGB image.
+
+    `before_px` are his landmarks in the frame before, if known: they tell left from right.
+    """
     points, confidences, scores, people = [], [], [], []
     for turn_rad in TURNS_RAD:
         turned = replace(region, angle_rad=region.angle_rad + turn_rad)
@@ -132,19 +138,19 @@ def estimate_pose(
             confidences.append(answer.confidence)
             scores.append(answer.pose_score)
             people.append(warp_back(answer.person, turned, shape=image.shape[:2]))
-    weights = np.array(confidences)[..., None] + 1e-6  # a point nobody is sure of: plain mean
-    landmarks = (np.array(points) * weights).sum(0) / weights.sum(0)
+    found = agree(np.array(points), np.array(confidences), before_px, side_px=region.side_px)
     person = np.clip(np.mean(people, axis=0, dtype=np.float32), 0, 1)
     together = person >= 0.5
     agreement = np.mean([intersection_over_union(one >= 0.5, together) for one in people])
     return Pose(
         region=region,
-        keypoints_px=landmarks[:NUM_KEYPOINTS],
-        confidence=np.mean(confidences, axis=0)[:NUM_KEYPOINTS],
+        landmarks_px=found.landmarks_px,
+        confidence=found.confidence,
+        votes=found.votes,
         pose_score=float(np.mean(scores)),
         person=person,
         agreement=float(agreement),
-        next_region=region_of_person(landmarks[HIP], landmarks[FULL_BODY]),
+        next_region=region_of_person(found.landmarks_px[HIP], found.landmarks_px[FULL_BODY]),
     )
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from ntop.conventions import MASK_ALPHA
 from ntop.masks.background import subtract_background
-from ntop.masks.landmarks import SIZE
+from ntop.masks.landmarks import NUM_KEYPOINTS, SIZE
 from ntop.masks.mattes import MIN_POINT_CONFIDENCE, keep_person, sharpen_matte
 from ntop.masks.tracking import Sighting
 
@@ -34,10 +34,11 @@ def segment_person(image: Image, sighting: Sighting) -> Segmentation:
         return _unusable(image, sighting.reason)
     radius_px = max(1, round(RADIUS_CROP_PX * pose.region.side_px / SIZE))
     matte = sharpen_matte(image, pose.person, radius_px=radius_px)
-    matte = keep_person(matte, pose.keypoints_px, pose.confidence, radius_px=radius_px)
+    points, confidence = pose.landmarks_px[:NUM_KEYPOINTS], pose.confidence[:NUM_KEYPOINTS]
+    matte = keep_person(matte, points, confidence, radius_px=radius_px)
     if not has_person(matte):
         return _unusable(image, "empty mask")
-    share = share_on_mask(matte, pose.keypoints_px, pose.confidence)
+    share = share_on_mask(matte, points, confidence)
     if share < MIN_ON_MASK:
         return _unusable(image, f"only {share:.0%} of the keypoints lie on the mask")
     return Segmentation(matte, pose.pose_score * pose.agreement, "")

@@ -39,39 +39,38 @@ class Sighting:
 
 
 def follow_person(
-    networks: Networks, image: UInt8[np.ndarray, "height width 3"], last: Region | None
+    networks: Networks, image: UInt8[np.ndarray, "height width 3"], last: Pose | None
 ) -> Sighting:
-    """The person last seen in `last` (None: not yet seen) in the next frame."""
+    """The person last seen as `last` (None: not yet seen) in the next frame."""
     if last is not None:
-        sighting = _look_closely(networks, image, near=last, last=last)
+        sighting = _look_closely(networks, image, near=last.next_region, last=last)
         if sighting.pose is not None:
             return sighting
     people = detect_people(networks.detector, image)
     if last is not None:
-        people = [person for person in people if _moved_too_far(person.region, last) == ""]
+        people = [p for p in people if not _moved_too_far(p.region, last.next_region)]
     if not people:
         where = "detected" if last is None else "detected near his last place"
         return Sighting(None, f"no person {where}")
-    near = _main_person(people, image, last).region
-    return _look_closely(networks, image, near=near, last=last)
+    near = _main_person(people, image, None if last is None else last.next_region)
+    return _look_closely(networks, image, near=near.region, last=last)
 
 
 def _look_closely(
-    networks: Networks, image: np.ndarray, *, near: Region, last: Region | None
+    networks: Networks, image: np.ndarray, *, near: Region, last: Pose | None
 ) -> Sighting:
     """The person in the region `near`: the first look finds his place, the others measure."""
     region, score = locate_person(networks.landmarks, image, near)
     refusal = _refusal(region, score, last)
     if refusal:
         return Sighting(None, refusal)
-    pose = estimate_pose(networks.landmarks, image, region)
+    before_px = None if last is None else last.landmarks_px
+    pose = estimate_pose(networks.landmarks, image, region, before_px=before_px)
     refusal = _refusal(pose.next_region, pose.pose_score, last)
     return Sighting(None, refusal) if refusal else Sighting(pose, "")
 
 
-def _main_person(
-    people: list[Detection], image: np.ndarray, last: Region | None
-) -> Detection:
+def _main_person(people: list[Detection], image: np.ndarray, last: Region | None) -> Detection:
     """The largest, most central person; or the one closest to the last place."""
     if last is not None:
         return min(people, key=lambda p: _distance_px(p.region, last))
@@ -84,11 +83,11 @@ def _main_person(
     )
 
 
-def _refusal(region: Region, pose_score: float, last: Region | None) -> str:
+def _refusal(region: Region, pose_score: float, last: Pose | None) -> str:
     """Why what is seen in `region` is not the person, or nothing."""
     if pose_score < MIN_POSE_SCORE:
         return f"pose score {pose_score:.2f} below {MIN_POSE_SCORE}"
-    return "" if last is None else _moved_too_far(region, last)
+    return "" if last is None else _moved_too_far(region, last.next_region)
 
 
 def _moved_too_far(region: Region, last: Region) -> str:

@@ -25,6 +25,7 @@ from jaxtyping import UInt8
 from ntop.config import MaskConfig
 from ntop.conventions import DataError
 from ntop.masks.background import temporal_median
+from ntop.masks.consensus import GROUPS, naming
 from ntop.masks.landmarks import NUM_KEYPOINTS
 from ntop.masks.network import Network
 from ntop.masks.segmentation import (
@@ -86,41 +87,45 @@ def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
     # One thread per core: networks and OpenCV compute outside Python's lock, and what comes out
     # of a view does not depend on the other views.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        done = [pair for part in pool.map(lambda view: process_view(job, view), views)
-                for pair in part]  # fmt: skip
+        done = list(pool.map(lambda view: process_view(job, view), views))
+    masks = [mask for view, _ in done for mask in view]
+    points = [point for _, view in done for point in view]
+    reasons = [mask["reason"] for mask in masks]
     if job.wants_masks:
-        masks = [mask for mask, _ in done]
         if all(mask["confidence"] == 0 for mask in masks):
-            raise DataError(_nothing_usable(capture, "mask", [m["reason"] for m in masks]))
+            raise DataError(_nothing_usable(capture, "mask", reasons))
         write_table(masks, schema=schemas.MASK, path=out / "masks.parquet")
     if job.wants_keypoints:
-        points = [point for _, point in done]
         if not any(any(point["confidence"]) for point in points):
-            raise DataError(_nothing_usable(capture, "keypoint", [m["reason"] for m, _ in done]))
+            raise DataError(_nothing_usable(capture, "keypoint", reasons))
         write_table(points, schema=schemas.KEYPOINTS2D, path=out / "keypoints2d.parquet")
 
 
-def process_view(job: Job, rows: list[Row]) -> list[tuple[Row, Row]]:
-    """Mask and keypoint row of every frame of one view, followed in time; writes the mattes."""
+def process_view(job: Job, rows: list[Row]) -> tuple[list[Row], list[Row]]:
+    """Mask and keypoint rows of one view's frames, followed in time; writes the mattes."""
     usable = [row for row in rows if not row["reason"]]
     networks = _load_networks(job)
     by_plate = job.wants_masks and job.config.method == "background" and usable
     plate = _read_plate(job, usable) if by_plate else None
-    results, last = [], None
+    masks, points, last = [], [], None
+    votes = np.zeros(len(GROUPS), int)
     for row, image in _in_time(job, usable):
         sighting = follow_person(networks, image, last) if networks else Sighting(None, "")
-        last = sighting.pose.next_region if sighting.pose else last
+        if sighting.pose:
+            last, votes = sighting.pose, votes + sighting.pose.votes
         if plate is None:
             found = segment_person(image, sighting)
         else:
             found = segment_difference(image, plate)
-        results.append((_mask_row(job, row, found), _keypoint_row(row, sighting)))
+        masks.append(_mask_row(job, row, found))
+        points.append(_keypoint_row(row, sighting))
     for row in rows:
         if row["reason"]:
             empty = np.zeros((row["height"], row["width"]), np.float32)
-            found = Segmentation(empty, 0.0, row["reason"])
-            results.append((_mask_row(job, row, found), _keypoint_row(row, Sighting(None, ""))))
-    return results
+            masks.append(_mask_row(job, row, Segmentation(empty, 0.0, row["reason"])))
+            points.append(_keypoint_row(row, Sighting(None, "")))
+    # continuity named left and right alike in all frames; the majority of all looks says which
+    return masks, [_renamed(point, naming(votes < 0)[:NUM_KEYPOINTS]) for point in points]
 
 
 def _load_networks(job: Job) -> Networks | None:
@@ -184,13 +189,20 @@ def _read_override(path: Path, row: Row) -> Segmentation:
 
 def _keypoint_row(row: Row, sighting: Sighting) -> Row:
     pose = sighting.pose
-    points = np.zeros((NUM_KEYPOINTS, 2)) if pose is None else pose.keypoints_px
-    confidence = np.zeros(NUM_KEYPOINTS) if pose is None else pose.confidence
+    landmarks = np.zeros((NUM_KEYPOINTS, 2)) if pose is None else pose.landmarks_px[:NUM_KEYPOINTS]
+    confidence = np.zeros(NUM_KEYPOINTS) if pose is None else pose.confidence[:NUM_KEYPOINTS]
     return {key: row[key] for key in KEY} | {
         "skeleton": SKELETON,
-        "keypoints_px": points.ravel().tolist(),
+        "keypoints_px": landmarks.ravel().tolist(),
         "confidence": confidence.tolist(),
     }
+
+
+def _renamed(row: Row, order: np.ndarray) -> Row:
+    """The keypoints in another order."""
+    points = np.array(row["keypoints_px"]).reshape(-1, 2)[order]
+    confidence = np.array(row["confidence"])[order]
+    return row | {"keypoints_px": points.ravel().tolist(), "confidence": confidence.tolist()}
 
 
 def _nothing_usable(capture: Path, what: str, reasons: list[str]) -> str:

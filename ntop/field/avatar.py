@@ -1,0 +1,113 @@
+"""An avatar on disk: one person's canonical field, loadable without the training code.
+
+`avatar.safetensors` holds the bricks (float16 values: rounding stays below 1/16 grey level) and
+the light; `avatar.json` says what they mean, and the hash of the former.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from jaxtyping import Float
+from safetensors import SafetensorError
+
+from ntop import __version__
+from ntop.conventions import NUM_BETAS, DataError
+from ntop.field.canonical import CanonicalGrid
+from ntop.field.kernels.tables import VOID_RAW
+
+FORMAT = 1
+ARRAYS_NAME = "avatar.safetensors"
+HEADER_NAME = "avatar.json"
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """One person's canonical field.
+
+    `light` (9, 3): quadratic in the world normal per colour (see `kernels.tables.shade`).
+    `reach_m`: how far beyond the body's surface the field may hold density.
+    """
+
+    grid: CanonicalGrid
+    light: Float[np.ndarray, "9 3"]
+    betas: tuple[float, ...]
+    reach_m: float
+    step: int
+
+
+def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
+    """Write both files through `write(path, bytes)` and return the arrays' sha256.
+
+    The void brick is left out; values of all others are kept, as training left them.
+    """
+    grid = avatar.grid
+    content = safetensors.numpy.save(
+        {
+            "values": grid.values[64:].astype(np.float16),
+            "positions": grid.positions[1:],
+            "light": avatar.light.astype(np.float32),
+        }
+    )
+    digest = hashlib.sha256(content).hexdigest()
+    header = {
+        "format": FORMAT,
+        "ntop": __version__,
+        "sha256": digest,
+        "step": avatar.step,
+        "betas": list(avatar.betas),
+        "reach_m": avatar.reach_m,
+        "voxel_m": grid.voxel_m,
+        "origin_m": [float(x) for x in grid.origin],
+        "bricks": list(grid.bricks.shape),
+        "void_raw": VOID_RAW,
+    }
+    write(folder / ARRAYS_NAME, content)
+    write(folder / HEADER_NAME, (json.dumps(header, indent=1) + "\n").encode())
+    return digest
+
+
+def load_avatar(folder: Path) -> Avatar:
+    """Read an avatar.
+
+    Raises:
+        DataError: a file is missing or broken, of another format, or not the one its header names.
+    """
+    try:
+        header = json.loads((folder / HEADER_NAME).read_text())
+        content = (folder / ARRAYS_NAME).read_bytes()
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read avatar {folder}: {error}; train it again") from error
+    digest = hashlib.sha256(content).hexdigest()
+    if header.get("format") != FORMAT or header.get("sha256") != digest:
+        raise DataError(
+            f"avatar {folder}: format {header.get('format')}, arrays' sha256 {digest[:12]}; "
+            f"expected format {FORMAT} and {str(header.get('sha256'))[:12]}; train it again"
+        )
+    try:
+        arrays = safetensors.numpy.load(content)
+        betas = tuple(float(x) for x in header["betas"])
+        positions, stored = arrays["positions"], arrays["values"]
+        bricks = np.zeros(header["bricks"], np.int32)
+        bricks[tuple(positions.T)] = np.arange(1, len(positions) + 1)
+    except (SafetensorError, KeyError, IndexError, ValueError) as error:
+        raise DataError(f"avatar {folder} is damaged: {error!r}; train it again") from error
+    if len(betas) != NUM_BETAS or stored.shape != (64 * len(positions), 4):
+        raise DataError(
+            f"avatar {folder}: {len(betas)} betas and values {stored.shape}; expected {NUM_BETAS} "
+            f"and {(64 * len(positions), 4)}; train it again"
+        )
+    void = np.zeros((64, 4), np.float32)
+    void[:, 0] = header["void_raw"]
+    grid = CanonicalGrid(
+        values=np.concatenate([void, stored.astype(np.float32)]),
+        bricks=bricks,
+        positions=np.concatenate([np.full((1, 3), -1, np.int32), positions]),
+        origin=np.array(header["origin_m"]),
+        voxel_m=float(header["voxel_m"]),
+    )
+    return Avatar(grid, arrays["light"], betas, float(header["reach_m"]), int(header["step"]))

@@ -1,0 +1,131 @@
+"""The whole state of a training on disk: values, optimiser, step, light, occupancy, curve.
+
+Random numbers depend on the seed and the step's number, so the step stands for the generator.
+"""
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from jaxtyping import Float, Int
+from safetensors import SafetensorError
+
+from ntop.conventions import DataError
+from ntop.field.canonical import CanonicalGrid, Occupancy
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """Everything a step reads and changes. Arrays are changed in place by the optimiser."""
+
+    grid: CanonicalGrid
+    first: Float[np.ndarray, "row 4"]
+    second: Float[np.ndarray, "row 4"]
+    counts: Int[np.ndarray, " slot"]
+    occupancy: Occupancy
+    light: Float[np.ndarray, "9 3"]
+    light_moments: Float[np.ndarray, "2 9 3"]
+    gain: Float[np.ndarray, "camera 2 3"]
+    gain_moments: Float[np.ndarray, "2 camera 2 3"]
+    level: int
+    step: int
+    curve: list[Any]
+
+    @staticmethod
+    def fresh(
+        *, grid: CanonicalGrid, occupancy: Occupancy, light: np.ndarray, gain: np.ndarray
+    ) -> "TrainingState":
+        """Step 0, with empty moments."""
+        return TrainingState(
+            grid=grid,
+            first=np.zeros_like(grid.values),
+            second=np.zeros_like(grid.values),
+            counts=np.zeros(len(grid.positions), np.int64),
+            occupancy=occupancy,
+            light=light,
+            light_moments=np.zeros((2, *light.shape)),
+            gain=gain,
+            gain_moments=np.zeros((2, *gain.shape)),
+            level=0,
+            step=0,
+            curve=[],
+        )
+
+    def with_grid(self, grid: CanonicalGrid, *, level: int) -> "TrainingState":
+        """The same state on another grid; the moments start anew."""
+        return replace(
+            self,
+            grid=grid,
+            level=level,
+            first=np.zeros_like(grid.values),
+            second=np.zeros_like(grid.values),
+            counts=np.zeros(len(grid.positions), np.int64),
+        )
+
+
+ARRAYS = ("first", "second", "counts", "light", "light_moments", "gain", "gain_moments")
+GRID_ARRAYS = ("values", "bricks", "positions", "origin")
+
+
+def settings_digest(settings: Any) -> str:
+    """A name for settings: a checkpoint of other settings must not be continued."""
+    text = json.dumps(dataclasses.asdict(settings), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
+    """Write the state atomically: a new file beside the old one, then one rename."""
+    arrays = {name: getattr(state, name) for name in ARRAYS}
+    arrays |= {f"grid_{name}": getattr(state.grid, name) for name in GRID_ARRAYS}
+    arrays |= {"occupancy": state.occupancy.cells, "occupancy_origin": state.occupancy.origin}
+    header = {
+        "settings": settings_digest(settings),
+        "voxel_m": state.grid.voxel_m,
+        "occupancy_spacing_m": state.occupancy.spacing_m,
+        "level": state.level,
+        "step": state.step,
+        "curve": [dataclasses.astuple(line) for line in state.curve],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    safetensors.numpy.save_file(arrays, temporary, metadata={"state": json.dumps(header)})
+    temporary.replace(path)
+
+
+def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | None:
+    """The saved state; None where there is none, or it was made with other settings.
+
+    `line` is the type of the curve's entries.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    try:
+        with safetensors.safe_open(path, framework="numpy") as stream:
+            header = json.loads(stream.metadata()["state"])
+            arrays = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise DataError(f"checkpoint {path} is damaged ({error}); delete it") from error
+    if header["settings"] != settings_digest(settings):
+        return None
+    grid = CanonicalGrid(
+        **{name: arrays[f"grid_{name}"] for name in GRID_ARRAYS}, voxel_m=header["voxel_m"]
+    )
+    return TrainingState(
+        grid=grid,
+        occupancy=Occupancy(
+            arrays["occupancy"], arrays["occupancy_origin"], header["occupancy_spacing_m"]
+        ),
+        level=header["level"],
+        step=header["step"],
+        curve=[line(*values) for values in header["curve"]],
+        **{name: arrays[name] for name in ARRAYS},
+    )

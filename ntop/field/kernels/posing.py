@@ -1,0 +1,316 @@
+"""Build one pose's warp grid: nearest surface, canonical positions of nodes, sheets of cells.
+
+Twin of the geometry: `tests/field/test_warp.py` compares with brute force and forward skinning.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from ntop.field.kernels import device, kernel
+from ntop.field.kernels.tables import canonical_point
+
+MIN_VOLUME = 0.05  # a blended bone transform that shrinks volume below this has no usable inverse
+SLAB = 4  # nodes along x that one task owns
+
+
+@kernel
+def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone, maps):
+    """Per vertex the affine map posed -> canonical that sends the posed vertex to its own rest.
+
+    Where blending has collapsed (candy wrapper), the vertex's main bone stands in, rigidly.
+
+    Args:
+        blended: (V, 3, 4) this pose's blend, rest -> posed. canonical_from_rest: (V, 3, 4) blend.
+        canonical, posed: (V, 3) vertices, metres. bones: (24, 3, 4) rigid, canonical -> posed.
+        main_bone: (V,). maps: (V, 3, 4) output.
+    """
+    for v in numba.prange(canonical.shape[0]):
+        a = blended[v]
+        c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+        c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+        c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+        det = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+        if det > MIN_VOLUME:
+            inverse = np.empty((3, 3), np.float64)
+            inverse[0, 0], inverse[1, 0], inverse[2, 0] = c00 / det, c01 / det, c02 / det
+            inverse[0, 1] = (a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]) / det
+            inverse[1, 1] = (a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]) / det
+            inverse[2, 1] = (a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]) / det
+            inverse[0, 2] = (a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]) / det
+            inverse[1, 2] = (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) / det
+            inverse[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) / det
+            for i in range(3):
+                for j in range(3):
+                    total = 0.0
+                    for k in range(3):
+                        total += canonical_from_rest[v, i, k] * inverse[k, j]
+                    maps[v, i, j] = total
+        else:
+            bone = bones[main_bone[v]]
+            for i in range(3):
+                for j in range(3):
+                    maps[v, i, j] = bone[j, i]  # rigid: the inverse is the transpose
+        for i in range(3):
+            moved = 0.0
+            for j in range(3):
+                moved += maps[v, i, j] * posed[v, j]
+            maps[v, i, 3] = canonical[v, i] - moved
+
+
+@kernel
+def nearest_vertices(posed, canonical, dims, cell, radius, apart, candidates, nearest, distance):
+    """For each node the nearest posed vertex, and the nearest of another part of the body.
+
+    Args:
+        posed: (V, 3) metres relative to node (0, 0, 0). canonical: (V, 3) metres.
+        dims: (3,) nodes. cell: node spacing (m). radius: search radius (m).
+        apart: canonical distance (m) from which a vertex counts as another part.
+        candidates: 1 or 2; with 1 the second is left empty.
+        nearest: (2, nodes) int32 output, -1 where none. distance: (2, nodes) squared metres.
+    """
+    ny, nz = dims[1], dims[2]
+    limit = radius * radius
+    inverse = 1 / cell
+    for slab in numba.prange((dims[0] + SLAB - 1) // SLAB):
+        first, last = slab * SLAB, min(dims[0], (slab + 1) * SLAB) - 1
+        for n in range(first * ny * nz, (last + 1) * ny * nz):
+            nearest[0, n] = nearest[1, n] = -1
+            distance[0, n] = distance[1, n] = limit
+        for candidate in range(candidates):
+            for v in range(posed.shape[0]):
+                x, y, z = posed[v, 0], posed[v, 1], posed[v, 2]
+                i0 = max(first, int(math.ceil((x - radius) * inverse)))
+                i1 = min(last, int(math.floor((x + radius) * inverse)))
+                if i0 > i1:
+                    continue
+                j0 = max(0, int(math.ceil((y - radius) * inverse)))
+                j1 = min(ny - 1, int(math.floor((y + radius) * inverse)))
+                k0 = max(0, int(math.ceil((z - radius) * inverse)))
+                k1 = min(nz - 1, int(math.floor((z + radius) * inverse)))
+                for i in range(i0, i1 + 1):
+                    dx = (i * cell - x) ** 2
+                    for j in range(j0, j1 + 1):
+                        dxy = dx + (j * cell - y) ** 2
+                        if dxy >= limit:
+                            continue
+                        for k in range(k0, k1 + 1):
+                            d = dxy + (k * cell - z) ** 2
+                            n = (i * ny + j) * nz + k
+                            if d < distance[candidate, n]:
+                                if candidate == 1:
+                                    u = nearest[0, n]
+                                    gap = (
+                                        (canonical[v, 0] - canonical[u, 0]) ** 2
+                                        + (canonical[v, 1] - canonical[u, 1]) ** 2
+                                        + (canonical[v, 2] - canonical[u, 2]) ** 2
+                                    )
+                                    if gap < apart * apart:
+                                        continue
+                                distance[candidate, n] = d
+                                nearest[candidate, n] = v
+
+
+@device
+def closest_weights(p, a, b, c):
+    """Barycentric weights of the point of triangle abc closest to p, and the squared distance.
+
+    Regions of the triangle as in Ericson, Real-Time Collision Detection, 5.1.5.
+    """
+    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    ap0, ap1, ap2 = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    d1 = ab0 * ap0 + ab1 * ap1 + ab2 * ap2
+    d2 = ac0 * ap0 + ac1 * ap1 + ac2 * ap2
+    aa = ab0 * ab0 + ab1 * ab1 + ab2 * ab2
+    cc = ac0 * ac0 + ac1 * ac1 + ac2 * ac2
+    bc = ab0 * ac0 + ab1 * ac1 + ab2 * ac2
+    d3, d4, d5, d6 = d1 - aa, d2 - bc, d1 - bc, d2 - cc
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if d1 <= 0 and d2 <= 0:
+        v, w = 0.0, 0.0
+    elif d3 >= 0 and d4 <= d3:
+        v, w = 1.0, 0.0
+    elif d6 >= 0 and d5 <= d6:
+        v, w = 0.0, 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v, w = d1 / (d1 - d3), 0.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        v, w = 0.0, d2 / (d2 - d6)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1 - w
+    else:
+        total = va + vb + vc
+        v, w = vb / total, vc / total
+    q0 = ap0 - v * ab0 - w * ac0
+    q1 = ap1 - v * ab1 - w * ac1
+    q2 = ap2 - v * ab2 - w * ac2
+    return 1 - v - w, v, w, q0 * q0 + q1 * q1 + q2 * q2
+
+
+@device
+def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces, weights):
+    """Face around vertex v whose surface is closest to p; fills its weights (3).
+
+    Returns the face and the squared distance; face -1 where no face has the vertex.
+    """
+    best, chosen = np.inf, -1
+    for r in range(ring_offsets[v], ring_offsets[v + 1]):
+        f = ring_faces[r]
+        a, b, c, d = closest_weights(
+            p, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        )
+        if d < best:
+            best, chosen = d, f
+            weights[0], weights[1], weights[2] = a, b, c
+    return chosen, best
+
+
+@kernel
+def node_records(
+    node_ids, posed, faces, ring_offsets, ring_faces, maps, normals, dims, cell, nearest, distance,
+    records,
+):  # fmt: skip
+    """Canonical position and normal of each listed node, from the surface closest to it.
+
+    Args:
+        node_ids: (any, 2) node number and candidate (0, 1). maps, normals: per vertex.
+        distance: (2, nodes) squared metres; sharpened from vertex to surface distance.
+        records: (any, 6) output.
+    """
+    for n in numba.prange(node_ids.shape[0]):
+        node, candidate = node_ids[n, 0], node_ids[n, 1]
+        p = np.empty(3, np.float64)
+        weights = np.empty(3, np.float64)
+        p[0] = (node // (dims[1] * dims[2])) * cell
+        p[1] = (node // dims[2] % dims[1]) * cell
+        p[2] = (node % dims[2]) * cell
+        v = nearest[candidate, node]
+        face, d = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
+        distance[candidate, node] = d
+        for i in range(3):
+            position, normal = 0.0, 0.0
+            for corner in range(3):
+                u = faces[face, corner]
+                m = maps[u, i]
+                position += weights[corner] * (m[0] * p[0] + m[1] * p[1] + m[2] * p[2] + m[3])
+                normal += weights[corner] * normals[u, i]
+            records[n, i] = position
+            records[n, 3 + i] = normal
+
+
+@device
+def apply_map(m, x, y, z, out):
+    """out = affine map (3, 4) of a point."""
+    for i in range(3):
+        out[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+
+
+@kernel
+def cell_sheets(
+    cell_ids, dims, cell, nearest, distance, record_of, records, maps, normals, reach, agree,
+    sheets, extra_count, extra,
+):  # fmt: skip
+    """One or two consistent sheets per cell, each with a canonical position at all 8 corners.
+
+    A sheet starts at the corner that is closest to a surface; the map of that corner's vertex,
+    applied to the other corners, predicts where they must lie. A corner whose own record disagrees
+    (it is nearer to another part) gets the prediction instead, so that interpolation never mixes
+    two parts. The second sheet starts at the closest record that disagrees with the first.
+
+    Args:
+        cell_ids: (cells,) number of each cell's first node. record_of: (2, nodes) record or -1.
+        reach: surface distance (m) up to which a second sheet is kept. agree: tolerance (m).
+        sheets: (cells, 2, 8): record number, or -2 - e for extra e of this cell (-1: no sheet).
+        extra_count: (cells,). extra: (cells, 16, 6) output.
+    """
+    for number in numba.prange(cell_ids.shape[0]):
+        base = cell_ids[number]
+        bx, by = base // (dims[1] * dims[2]), base // dims[2] % dims[1]
+        bz = base % dims[2]
+        predicted = np.empty(3, np.float64)
+        used = 0
+        first_vertex = -1
+        for sheet in range(2):
+            start, start_candidate, start_corner = np.inf, -1, -1
+            for corner in range(8):
+                i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+                node = base + (i * dims[1] + j) * dims[2] + k
+                for candidate in range(2):
+                    record = record_of[candidate, node]
+                    if record < 0 or distance[candidate, node] >= start:
+                        continue
+                    if sheet == 1:
+                        if distance[candidate, node] > reach * reach:
+                            continue
+                        apply_map(
+                            maps[first_vertex], (bx + i) * cell, (by + j) * cell, (bz + k) * cell,
+                            predicted,
+                        )  # fmt: skip
+                        gap = 0.0
+                        for a in range(3):
+                            gap += (records[record, a] - predicted[a]) ** 2
+                        if gap < 4 * agree * agree:
+                            continue
+                    start, start_candidate, start_corner = distance[candidate, node], candidate, corner
+            if start_corner < 0:
+                sheets[number, sheet, 0] = -1
+                continue
+            i, j, k = start_corner >> 2, (start_corner >> 1) & 1, start_corner & 1
+            vertex = nearest[start_candidate, base + (i * dims[1] + j) * dims[2] + k]
+            if sheet == 0:
+                first_vertex = vertex
+            for corner in range(8):
+                i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+                node = base + (i * dims[1] + j) * dims[2] + k
+                apply_map(
+                    maps[vertex], (bx + i) * cell, (by + j) * cell, (bz + k) * cell, predicted
+                )
+                best, chosen = agree * agree, -1
+                for candidate in range(2):
+                    record = record_of[candidate, node]
+                    if record >= 0:
+                        gap = 0.0
+                        for a in range(3):
+                            gap += (records[record, a] - predicted[a]) ** 2
+                        if gap < best:
+                            best, chosen = gap, record
+                if chosen >= 0:
+                    sheets[number, sheet, corner] = chosen
+                else:
+                    sheets[number, sheet, corner] = -2 - used
+                    for a in range(3):
+                        extra[number, used, a] = predicted[a]
+                        extra[number, used, 3 + a] = normals[vertex, a]
+                    used += 1
+        extra_count[number] = used
+
+
+@kernel
+def octant_occupancy(warp, canonical_occupancy, origin, inverse_spacing, occupancy):
+    """Bit c of a cell: does the canonical occupancy allow density at the centre of octant c?
+
+    `canonical_occupancy` must be dilated by the half diagonal of an octant.
+    """
+    for cell in numba.prange(occupancy.shape[0]):
+        bits = 0
+        for octant in range(8):
+            fx = 0.75 if octant & 4 else 0.25
+            fy = 0.75 if octant & 2 else 0.25
+            fz = 0.75 if octant & 1 else 0.25
+            for sheet in range(2):
+                if warp.sheets[cell, sheet, 0] >= 0:
+                    x, y, z = canonical_point(warp, cell, sheet, fx, fy, fz)
+                    i = int(math.floor((x - origin[0]) * inverse_spacing))
+                    j = int(math.floor((y - origin[1]) * inverse_spacing))
+                    k = int(math.floor((z - origin[2]) * inverse_spacing))
+                    if (
+                        0 <= i < canonical_occupancy.shape[0]
+                        and 0 <= j < canonical_occupancy.shape[1]
+                        and 0 <= k < canonical_occupancy.shape[2]
+                        and canonical_occupancy[i, j, k]
+                    ):
+                        bits |= 1 << octant
+        occupancy[cell] = bits

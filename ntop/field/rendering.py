@@ -1,0 +1,262 @@
+"""Render a posed avatar through any camera: colour, opacity, depth and parts of every pixel.
+
+Only pixels that the projection of an occupied cell touches are marched; edges get four rays.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from ntop.body.model import BodyModel
+from ntop.body.skinning import BodyPose
+from ntop.conventions import PIXEL_CENTRE
+from ntop.field.avatar import Avatar
+from ntop.field.canonical import (
+    CanonicalGrid,
+    PartLabels,
+    canonical_body,
+    label_grid,
+    occupied_cells,
+)
+from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
+from ntop.field.kernels.tables import DENSITY_SCALE
+from ntop.field.kernels.tiles import TILE_PX, mark_tiles
+from ntop.field.warp import PoseWarp, occupied, pose_warp
+from ntop.geometry.cameras import Camera, Equidistant
+
+CELL_M = 0.02
+# four rays of a pixel on a rotated grid: distinct rows and columns, unbiased about the centre
+EDGE_OFFSETS_PX = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+EDGE_ALPHA = (0.02, 0.98)
+EDGE_CONTRAST = 0.08  # colour difference to a neighbour from which a pixel counts as an edge
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How exactly to march; every shortcut can be switched off, and costs at most its bound.
+
+    Args:
+        step_m: Distance of samples.
+        stop_transmittance: Light left at which a ray ends (0: never); bounds the colour's error.
+        colour_floor: Weight below which a sample adds no colour (0: all do).
+        raw_threshold: Raw density below which space counts as empty (-inf: nothing is skipped).
+        crop: March only pixels that may see the body.
+        edge_rays: 4: supersample edges; 1: one ray through every pixel's centre.
+        phase: Offset of all samples, in steps, for the phase-shift self-test.
+    """
+
+    step_m: float = 0.0025
+    stop_transmittance: float = 1e-3
+    colour_floor: float = 1e-4
+    raw_threshold: float = -4.0
+    crop: bool = True
+    edge_rays: int = 4
+    phase: float = 0.5
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One view. `rgb` is straight (not premultiplied) and meaningful where alpha > 0.
+
+    `depth_m` is the ray length at which half of the light is gone, 0 where nothing is; `parts`
+    holds label + 1. `window` (left, top, width, height) holds every pixel with alpha > 0; all is
+    zero outside. `evaluations` counts density look-ups.
+    """
+
+    rgb: Float[np.ndarray, "height width 3"]
+    alpha: Float[np.ndarray, "height width"]
+    depth_m: Float[np.ndarray, "height width"]
+    parts: UInt8[np.ndarray, "height width"]
+    window: tuple[int, int, int, int]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class RayRendering:
+    """Rays one by one; `rgb` is premultiplied."""
+
+    rgb: Float[np.ndarray, "ray 3"]
+    alpha: Float[np.ndarray, " ray"]
+    depth_m: Float[np.ndarray, " ray"]
+    parts: UInt8[np.ndarray, " ray"]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class PosedAvatar:
+    """All that the views of one pose share."""
+
+    grid: CanonicalGrid
+    warp: PoseWarp
+    light: Float[np.ndarray, "9 3"]
+    labels: PartLabels
+
+
+def pose_avatar(
+    avatar: Avatar,
+    model: BodyModel,
+    pose: BodyPose,
+    *,
+    settings: RenderSettings | None = None,
+    cell_m: float = CELL_M,
+) -> PosedAvatar:
+    """The per-pose work, once for all views: warp grid and occupancy of a single pose."""
+    settings = settings or RenderSettings()
+    body = canonical_body(model, avatar.betas)
+    warp = pose_warp(body, model, pose, cell_m=cell_m, reach_m=avatar.reach_m)
+    shared = _shared(avatar, model, settings.raw_threshold)
+    return PosedAvatar(
+        grid=avatar.grid,
+        warp=occupied(warp, shared[0]),
+        light=avatar.light.astype(np.float32),
+        labels=shared[1],
+    )
+
+
+_SHARED: dict[tuple, tuple] = {}
+
+
+def _shared(avatar: Avatar, model: BodyModel, raw_threshold: float) -> tuple:
+    """Occupancy and labels of an avatar, the same in every pose; kept for the last one."""
+    key = (id(avatar), id(model), raw_threshold)
+    if key not in _SHARED:
+        _SHARED.clear()
+        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=1)
+        labels = label_grid(canonical_body(model, avatar.betas))
+        _SHARED[key] = (occupancy, labels, avatar, model)  # held, so that no id is used twice
+    return _SHARED[key]
+
+
+def trace_rays(
+    posed: PosedAvatar,
+    center_world: Float[Tensor, " 3"],
+    directions_world: Float[Tensor, "ray 3"],
+    *,
+    settings: RenderSettings,
+) -> RayRendering:
+    """Rays from one point, in any directions (unit length)."""
+    count = len(directions_world)
+    origin = center_world.double().numpy() - posed.warp.origin_world
+    colours = np.empty((count, 3), np.float32)
+    opacity = np.empty(count, np.float32)
+    depth = np.empty(count, np.float32)
+    parts = np.empty(count, np.uint8)
+    evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
+    render_rays(
+        posed.grid.tables(), posed.warp.tables, posed.light, posed.labels.values,
+        posed.labels.origin, 1 / posed.labels.spacing_m, np.zeros(1, np.int64), origin[None],
+        np.ascontiguousarray(directions_world.numpy(), np.float64),
+        np.full(count, settings.phase), settings.step_m, settings.stop_transmittance,
+        settings.colour_floor, colours, opacity, depth, parts, evaluations,
+    )  # fmt: skip
+    return RayRendering(colours, opacity, depth, parts, int(evaluations.sum()))
+
+
+def render_view(
+    posed: PosedAvatar, camera: Camera, *, settings: RenderSettings | None = None
+) -> Rendering:
+    """One view through any lens; pixels outside the lens's valid circle stay empty."""
+    settings = settings or RenderSettings()
+    width, height = camera.lens.width, camera.lens.height
+    rgb = np.zeros((height, width, 3), np.float32)
+    alpha = np.zeros((height, width), np.float32)
+    depth = np.zeros((height, width), np.float32)
+    parts = np.zeros((height, width), np.uint8)
+    mask = body_pixels(posed, camera) if settings.crop else np.ones((height, width), bool)
+    window = _window(mask)
+    left, top, columns, rows = window
+    if columns == 0:
+        return Rendering(rgb, alpha, depth, parts, window, 0)
+    inner = (slice(top, top + rows), slice(left, left + columns))
+    v, u = np.nonzero(mask[inner])
+    centres = np.stack([u + left, v + top], 1) + PIXEL_CENTRE
+    first = _trace_pixels(posed, camera, centres, settings=settings)
+    straight, box_alpha = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
+    straight[v, u], box_alpha[v, u] = first.rgb, first.alpha
+    depth[v + top, u + left], parts[v + top, u + left] = first.depth_m, first.parts
+    evaluations = first.evaluations
+    if settings.edge_rays > 1:
+        edges = _edges(straight, box_alpha)[v, u]
+        shifted = centres[edges][:, None] + np.array(EDGE_OFFSETS_PX)
+        more = _trace_pixels(posed, camera, shifted.reshape(-1, 2), settings=settings)
+        straight[v[edges], u[edges]] = more.rgb.reshape(-1, 4, 3).mean(1)
+        box_alpha[v[edges], u[edges]] = more.alpha.reshape(-1, 4).mean(1)
+        evaluations += more.evaluations
+    # a pixel whose centre missed but whose corners hit has no depth of its own: leave 0
+    straight /= np.maximum(box_alpha, 1e-6)[..., None]
+    rgb[inner] = np.clip(straight, 0, 1)
+    alpha[inner] = box_alpha
+    depth[alpha == 0], parts[alpha == 0] = 0, 0
+    return Rendering(rgb, alpha, depth, parts, window, evaluations)
+
+
+def body_pixels(posed: PosedAvatar, camera: Camera) -> Bool[np.ndarray, "height width"]:
+    """Pixels that may see an occupied cell (conservative; whole tiles)."""
+    width, height = camera.lens.width, camera.lens.height
+    tables, cell_m = posed.warp.tables, posed.warp.cell_m
+    cells = tables.cells
+    full = np.flatnonzero((cells >= 0) & (tables.occupancy[np.maximum(cells, 0)] != 0))
+    index = np.stack(np.unravel_index(full, tables.dims[0]), 1)
+    centres = torch.from_numpy((index + 0.5) * cell_m + posed.warp.origin_world)
+    pixels, seen = camera.project(centres)
+    distances = (centres - camera.center_world).norm(dim=-1)
+    if isinstance(camera.lens, Equidistant):
+        # px per rad is f along the radius and f theta / sin(theta) across it
+        seen = seen | torch.isfinite(pixels).all(-1)
+        stretch = camera.lens.max_theta / max(math.sin(camera.lens.max_theta), 0.1)
+        px_per_rad = camera.lens.focal * max(1.0, stretch)
+    else:
+        # a pinhole's scale grows to f / cos^2 at the corner
+        corner = math.hypot(width / camera.lens.fx, height / camera.lens.fy) / 2
+        px_per_rad = max(camera.lens.fx, camera.lens.fy) * (1 + corner**2)
+    marked = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.uint8)
+    radius = cell_m * math.sqrt(3) / 2
+    if len(full) and float(distances.min()) < 2 * radius:
+        marked[:] = 1  # the camera is inside the body: every pixel may see it
+    else:
+        mark_tiles(
+            pixels.numpy(), distances.numpy(), seen.numpy(), radius, px_per_rad, marked
+        )
+    return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[:height, :width].astype(bool)
+
+
+def _trace_pixels(
+    posed: PosedAvatar,
+    camera: Camera,
+    pixels: Float[np.ndarray, "ray 2"],
+    *,
+    settings: RenderSettings,
+) -> RayRendering:
+    directions, valid = camera.rays(torch.from_numpy(pixels))
+    found = trace_rays(posed, camera.center_world, directions, settings=settings)
+    outside = ~valid.numpy()
+    for values in (found.rgb, found.alpha, found.depth_m, found.parts):
+        values[outside] = 0
+    return found
+
+
+def _window(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return 0, 0, 0, 0
+    left, top = int(columns[0]), int(rows[0])
+    return left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top
+
+
+def _edges(
+    premultiplied: Float[np.ndarray, "height width 3"], alpha: Float[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels that are partly covered, or differ from a neighbour in opacity or colour."""
+    edges = (alpha > EDGE_ALPHA[0]) & (alpha < EDGE_ALPHA[1])
+    layers = np.concatenate([premultiplied, alpha[..., None]], -1)
+    for axis in (0, 1):
+        step = np.abs(np.diff(layers, axis=axis)).max(-1) > EDGE_CONTRAST
+        first = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        edges[first] |= step
+        edges[second] |= step
+    return edges

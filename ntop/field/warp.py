@@ -1,0 +1,206 @@
+"""Warp grids: from a posed body to tables that take a world point back to canonical space.
+
+A world point belongs to the surface point closest to it and follows that point's blended bone
+transform back. This is exact on the surface and continuous off it until another part of the body
+is nearer; there a cell keeps two *sheets*, one per part, and the renderer takes the denser.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ntop.body.model import BodyModel
+from ntop.body.skinning import BodyPose, pose_body
+from ntop.field.canonical import CanonicalBody, Occupancy
+from ntop.field.kernels.posing import (
+    cell_sheets,
+    nearest_vertices,
+    node_records,
+    octant_occupancy,
+    vertex_maps,
+)
+from ntop.field.kernels.tables import WarpTables
+
+APART_M = 0.15  # canonical distance between what counts as different parts of the body
+AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
+EXTRA_PER_CELL = 16
+
+
+@dataclass(frozen=True)
+class PoseWarp:
+    """One pose's warp tables; `origin_world` (metres) is the grid's first node."""
+
+    tables: WarpTables
+    origin_world: Float[np.ndarray, " 3"]
+    cell_m: float
+
+
+def pose_warp(
+    body: CanonicalBody, model: BodyModel, pose: BodyPose, *, cell_m: float, reach_m: float
+) -> PoseWarp:
+    """Warp grid around a posed body, `reach_m` beyond its surface; occupancy is still empty."""
+    pose = BodyPose(
+        betas=pose.betas.double(),
+        global_orient=pose.global_orient.double(),
+        body_pose=pose.body_pose.double(),
+        transl=pose.transl.double(),
+    )
+    posed = pose_body(model, pose)
+    vertices_world = posed.vertices.numpy()
+    radius = reach_m + 1.8 * cell_m  # a cell's farthest corner
+    origin = vertices_world.min(0) - radius - 0.5 * cell_m
+    dims = np.ceil((vertices_world.max(0) + radius - origin) / cell_m).astype(np.int64) + 1
+    vertices = vertices_world - origin
+    maps, normals = _vertex_maps(body, posed.posed_from_rest.numpy(), vertices, origin)
+
+    count = int(dims.prod())
+    nearest = np.empty((2, count), np.int32)
+    distance = np.empty((2, count), np.float32)
+    nearest_vertices(
+        vertices.astype(np.float32), body.vertices.astype(np.float32), dims, cell_m, radius,
+        APART_M, 2, nearest, distance,
+    )  # fmt: skip
+    candidates, nodes = np.nonzero(nearest >= 0)
+    records = np.empty((len(nodes), 6), np.float32)
+    node_records(
+        np.stack([nodes, candidates], 1), vertices, body.faces, body.ring_offsets, body.ring_faces,
+        maps, normals, dims, cell_m, nearest, distance, records,
+    )  # fmt: skip
+    record_of = np.full((2, count), -1, np.int32)
+    record_of[candidates, nodes] = np.arange(len(nodes))
+
+    cells = _cells_near(distance[0].reshape(dims), reach_m, cell_m)
+    cell_ids = np.flatnonzero(cells >= 0)
+    base = np.ravel_multi_index(np.unravel_index(cell_ids, cells.shape), dims)
+    sheets = np.empty((len(base), 2, 8), np.int32)
+    extra_count = np.empty(len(base), np.int32)
+    extra = np.empty((len(base), EXTRA_PER_CELL, 6), np.float32)
+    cell_sheets(
+        base, dims, cell_m, nearest, distance, record_of, records, maps, normals, reach_m,
+        AGREE_M, sheets, extra_count, extra,
+    )  # fmt: skip
+    first_extra = len(records) + np.concatenate([[0], np.cumsum(extra_count)[:-1]])
+    extras = extra[np.arange(EXTRA_PER_CELL) < extra_count[:, None]]
+    sheets = np.where(sheets <= -2, first_extra[:, None, None] - 2 - sheets, sheets)
+    tables = WarpTables(
+        dims=(dims - 1)[None],
+        cell_offset=np.zeros(1, np.int64),
+        block_offset=np.zeros(1, np.int64),
+        inverse_cell=1 / cell_m,
+        cells=cells.ravel(),
+        sheets=sheets.astype(np.int32),
+        nodes=np.concatenate([records, extras]),
+        occupancy=np.zeros(len(base), np.uint8),
+        blocks=np.zeros(int(np.prod((dims + 2) // 4)), np.uint8),
+    )
+    return PoseWarp(tables, origin, cell_m)
+
+
+def occupied(warp: PoseWarp, occupancy: Occupancy) -> PoseWarp:
+    """The same warp that skips what the canonical occupancy rules out."""
+    tables = warp.tables
+    found = np.empty_like(tables.occupancy)
+    octant_occupancy(
+        tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, found
+    )
+    return replace(warp, tables=tables._replace(occupancy=found, blocks=_blocks(tables, found)))
+
+
+def joined(warps: list[PoseWarp]) -> WarpTables:
+    """One table of all poses, for training; pose p is `warps[p]`."""
+    tables = [warp.tables for warp in warps]
+    cell_start = np.cumsum([0] + [len(t.sheets) for t in tables])
+    node_start = np.cumsum([0] + [len(t.nodes) for t in tables])
+    return WarpTables(
+        dims=np.concatenate([t.dims for t in tables]),
+        cell_offset=np.cumsum([0] + [len(t.cells) for t in tables])[:-1],
+        block_offset=np.cumsum([0] + [len(t.blocks) for t in tables])[:-1],
+        inverse_cell=tables[0].inverse_cell,
+        cells=np.concatenate(
+            [np.where(t.cells >= 0, t.cells + s, -1) for t, s in zip(tables, cell_start[:-1], strict=True)]
+        ).astype(np.int32),
+        sheets=np.concatenate(
+            [np.where(t.sheets >= 0, t.sheets + s, -1) for t, s in zip(tables, node_start[:-1], strict=True)]
+        ).astype(np.int32),
+        nodes=np.concatenate([t.nodes for t in tables]),
+        occupancy=np.concatenate([t.occupancy for t in tables]),
+        blocks=np.concatenate([t.blocks for t in tables]),
+    )
+
+
+def identity_warp(
+    low_world: Float[np.ndarray, " 3"], high_world: Float[np.ndarray, " 3"], *, cell_m: float
+) -> PoseWarp:
+    """A warp that only shifts: canonical space is the world relative to the grid's first node."""
+    dims = np.ceil((high_world - low_world) / cell_m).astype(np.int64)
+    nodes = np.stack(np.meshgrid(*(np.arange(n + 1) for n in dims), indexing="ij"), -1)
+    records = np.zeros((*nodes.shape[:3], 6), np.float32)
+    records[..., :3] = nodes * cell_m
+    records[..., 5] = 1  # any unit normal
+    index = np.arange(nodes[..., 0].size, dtype=np.int32).reshape(nodes.shape[:3])
+    sheets = np.full((int(dims.prod()), 2, 8), -1, np.int32)
+    for corner in range(8):
+        i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+        part = index[i : i + dims[0], j : j + dims[1], k : k + dims[2]]
+        sheets[:, 0, corner] = part.ravel()
+    tables = WarpTables(
+        dims=dims[None],
+        cell_offset=np.zeros(1, np.int64),
+        block_offset=np.zeros(1, np.int64),
+        inverse_cell=1 / cell_m,
+        cells=np.arange(dims.prod(), dtype=np.int32),
+        sheets=sheets,
+        nodes=records.reshape(-1, 6),
+        occupancy=np.zeros(dims.prod(), np.uint8),
+        blocks=np.zeros(int(np.prod((dims + 3) // 4)), np.uint8),
+    )
+    return PoseWarp(tables, low_world.astype(np.float64), cell_m)
+
+
+def _vertex_maps(
+    body: CanonicalBody,
+    posed_from_rest: Float[np.ndarray, "24 4 4"],
+    vertices: Float[np.ndarray, "vertex 3"],
+    origin: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, "vertex 3 4"], Float[np.ndarray, "vertex 3"]]:
+    """Maps posed (relative to `origin`) -> canonical, and posed unit normals."""
+    bones = posed_from_rest.copy()
+    bones[:, :3, 3] -= origin
+    blended = (body.lbs_weights @ bones[:, :3].reshape(24, 12)).reshape(-1, 3, 4)
+    maps = np.empty((len(vertices), 3, 4))
+    canonical_bones = (bones @ body.rest_from_canonical_bones)[:, :3]
+    vertex_maps(
+        blended, body.canonical_from_rest, body.vertices, vertices, canonical_bones, body.parts,
+        maps,
+    )  # fmt: skip
+    # normals follow the inverse transpose of canonical -> posed, which is the transpose of `maps`
+    normals = (maps[:, :, :3] * body.normals[:, :, None]).sum(1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return maps, normals
+
+
+def _cells_near(
+    squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: float
+) -> np.ndarray:
+    """Cell numbers: cells with a corner within reach of the surface, -1 for the others."""
+    limit = (reach_m + 0.9 * cell_m) ** 2  # a point of the cell is this close to some corner
+    near = squared <= limit
+    any_corner = np.zeros(tuple(n - 1 for n in near.shape), bool)
+    for i, j, k in np.ndindex(2, 2, 2):
+        any_corner |= near[
+            i : i + any_corner.shape[0], j : j + any_corner.shape[1], k : k + any_corner.shape[2]
+        ]
+    return np.where(any_corner, np.cumsum(any_corner).reshape(any_corner.shape) - 1, -1).astype(
+        np.int32
+    )
+
+
+def _blocks(tables: WarpTables, occupancy: np.ndarray) -> np.ndarray:
+    dims = tables.dims[0]
+    cells = tables.cells.reshape(dims)
+    full = np.zeros(4 * ((dims + 3) // 4), bool)
+    full[: dims[0], : dims[1], : dims[2]] = (cells >= 0) & (occupancy[cells] != 0)
+    bx, by, bz = (n // 4 for n in full.shape)
+    return full.reshape(bx, 4, by, 4, bz, 4).any(axis=(1, 3, 5)).ravel().astype(np.uint8)

@@ -101,7 +101,7 @@ def human(value: float) -> str:
     """A number with three significant digits, without exponent where a person would use none."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
-    if abs(value) >= 1000:
+    if isinstance(value, int) or abs(value) >= 1000:
         return f"{value:,.0f}"
     if abs(value) < 1e-3:
         return f"{value:.1e}"

@@ -112,9 +112,12 @@ def check_masks(dataset: Dataset) -> MaskChecks:
     equal = total = on_mask = visible = 0
     for row in dataset.rows:
         mask = read_rgba(dataset.image_path(row))[..., 3] >= MASK_ALPHA
+        # run lengths are canonical: equal codes and sizes are equal masks
+        expected = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
         for code in codes.get(row["image_path"], []):
             total += 1
-            equal += bool(np.array_equal(coco_mask.decode(code).astype(bool), mask))
+            same_size = list(code["size"]) == list(expected["size"])
+            equal += same_size and code["counts"].encode("ascii") == expected["counts"]
         for person in row["persons"]:
             for points, flags in (
                 (person["keypoints2d_coco17_px"], person["visibility_coco17"]),

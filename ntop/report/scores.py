@@ -40,7 +40,7 @@ def mean_scores(scores: list[ImageScores]) -> ImageScores:
 def best_median_worst(scores: list[ImageScores]) -> dict[str, int]:
     """Which pictures to show, by `psnr_box_db`; fewer than three pictures give fewer names."""
     order = sorted(range(len(scores)), key=lambda index: -scores[index].psnr_box_db)
-    shown = {order[-1]: "worst", order[len(order) // 2]: "median", order[0]: "best"}
+    shown = {order[len(order) // 2]: "median", order[-1]: "worst", order[0]: "best"}
     return {shown[index]: index for index in order if index in shown}
 
 

@@ -46,6 +46,7 @@ SOMA_BONES = {
 
 
 def main() -> None:
+    """Evaluate Anny, fit the linear body, report the errors, write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     out = parser.parse_args().out

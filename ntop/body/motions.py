@@ -1,7 +1,8 @@
 """Motions apart from any body: joint rotations and a root path over time, and their retargeting.
 
-Clips come from files (`deepmimic.py`) or are authored (`authored_motions.py`). Body axes: x left, y up, z forward. World: z up. A standing body with
-zero heading faces world -y, its left is world +x.
+Clips come from files (`deepmimic.py`) or are authored (`authored_motions.py`). Body axes: x left,
+y up, z forward. World: z up. A standing body with zero heading faces world -y, its left is
+world +x.
 """
 
 from dataclasses import dataclass

@@ -1,0 +1,1 @@
+"""Arrays shipped with the package: the embedded body."""

@@ -113,7 +113,7 @@ class StudioSource(SourceSection):
     supersampling: int = Field(default=3, ge=1)
     truth_supersampling: int = Field(default=4, ge=1)
     seed: int = 0
-    light_to_ambient: float = Field(default=3.0, ge=0)
+    light_to_ambient: float = Field(default=3.5, ge=0)
     pose_noise_mm: float = Field(default=0.0, ge=0)
     calibration_noise_px: float = Field(default=0.0, ge=0)
     mask_growth_px: int = Field(default=0, description="Dilation (>0) or erosion (<0) of masks.")

@@ -7,6 +7,6 @@ rule fetch:
     wildcard_constraints:
         package="[a-z0-9_]+",
     conda:
-        "ntop"
+        "../../environment.yml"
     shell:
         "exec ntop fetch --name {wildcards.package} --out {output:q} 2> {log:q}"

@@ -9,7 +9,7 @@ rule capture:
     benchmark:
         "results/benchmarks/1_capture/{source}/{actor}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     resources:
         mem_mb=2000,
     params:

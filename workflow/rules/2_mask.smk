@@ -10,7 +10,7 @@ rule mask:
     benchmark:
         "results/benchmarks/2_mask/{source}/{actor}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     threads: 2
     resources:
         mem_mb=3000,

@@ -10,7 +10,7 @@ rule fit:
     benchmark:
         "results/benchmarks/3_fit/{source}/{actor}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     threads: 2
     resources:
         mem_mb=4000,

@@ -11,7 +11,7 @@ rule train:
     benchmark:
         "results/benchmarks/4_train/{source}/{actor}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     threads: 2
     resources:
         mem_mb=6000,

@@ -11,7 +11,7 @@ rule render:
     benchmark:
         "results/benchmarks/5_render/{source}/{actor}/{action}/{rig}/{shard}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     resources:
         mem_mb=3000,
         gpu=0,

@@ -9,7 +9,7 @@ rule annotate:
     benchmark:
         "results/benchmarks/6_annotate/{source}/{actor}/{action}/{rig}/{shard}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     resources:
         mem_mb=1000,
     params:

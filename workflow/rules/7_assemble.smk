@@ -10,7 +10,7 @@ rule assemble:
     benchmark:
         "results/benchmarks/7_assemble/{dataset}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     resources:
         mem_mb=2000,
     params:

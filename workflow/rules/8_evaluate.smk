@@ -13,7 +13,7 @@ rule evaluate:
     benchmark:
         "results/benchmarks/8_evaluate/{dataset}.tsv"
     conda:
-        "ntop"
+        "../../environment.yml"
     threads: 2
     resources:
         mem_mb=4000,

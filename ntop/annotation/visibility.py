@@ -25,13 +25,20 @@ OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2
 
 # Metres of own flesh and clothing between a keypoint and the surface that shows it.
 LIMB_RADIUS_M = {
-    "pelvis": 0.15, "hip": 0.14, "spine1": 0.15, "spine2": 0.15, "spine3": 0.15, "neck": 0.10,
-    "collar": 0.11, "head": 0.13, "shoulder": 0.09, "elbow": 0.07, "wrist": 0.06, "hand": 0.06,
-    "knee": 0.09, "ankle": 0.08, "foot": 0.07, "nose": 0.03, "eye": 0.03, "ear": 0.03,
+    "pelvis": 0.155, "hip": 0.120, "spine1": 0.152, "spine2": 0.145, "spine3": 0.148,
+    "neck": 0.090, "collar": 0.123, "head": 0.090, "shoulder": 0.075, "elbow": 0.043,
+    "wrist": 0.030, "hand": 0.034, "knee": 0.100, "ankle": 0.065, "foot": 0.050, "nose": 0.025,
+    "eye": 0.025, "ear": 0.023,
 }  # fmt: skip
-# A ray that runs along a limb (a thigh seen from above) meets its surface further in front.
-REACH = 1.6  # of the radius
+# A ray that runs along a limb (an arm seen from above) meets its surface further in front.
+REACH = 3.0  # of the radius,
+REACH_BEYOND_M = 0.12  # but not further than this beyond it: a neck is hidden below its head
+# parts that share flesh without being parent and child
+TOUCHING = (("neck", "left_collar"), ("neck", "right_collar"), ("left_collar", "right_collar"))
 SKIN_POINTS = ("nose", "eye", "ear")
+NEIGHBOURS = np.array(
+    [[0, 0], *((u, v) for v in (-1, 0, 1) for u in (-1, 0, 1) if (u, v) != (0, 0))]
+)
 
 
 @dataclass(frozen=True)
@@ -47,13 +54,19 @@ def limbs(names: tuple[str, ...], parts: tuple[int, ...]) -> Limbs:
     """The limbs of a skeleton's keypoints, from their names and the bones they sit on."""
     kinds = [name.removeprefix("left_").removeprefix("right_") for name in names]
     radius_m = np.array([LIMB_RADIUS_M[kind] for kind in kinds])
-    reach = np.array([1.0 if kind in SKIN_POINTS else REACH for kind in kinds])
-    own_parts = np.zeros((len(names), len(SMPL24_PARENTS) + 1), bool)
-    for keypoint, part in enumerate(parts):
-        for other, parent in enumerate(SMPL24_PARENTS):
-            near = part in (other, parent) or SMPL24_PARENTS[part] == other
-            own_parts[keypoint, other + 1] = near
-    return Limbs(radius_m, radius_m * reach, own_parts)
+    on_skin = np.array([kind in SKIN_POINTS for kind in kinds])
+    near = np.eye(len(SMPL24_PARENTS), dtype=bool)
+    pairs = [(child, parent) for child, parent in enumerate(SMPL24_PARENTS) if parent >= 0]
+    pairs += [(SMPL24_NAMES.index(a), SMPL24_NAMES.index(b)) for a, b in TOUCHING]
+    for a, b in pairs:
+        near[a, b] = near[b, a] = True
+    own_parts = np.pad(near[list(parts)], ((0, 0), (1, 0)))  # the image's 0 is nobody's part
+    return Limbs(radius_m, np.where(on_skin, radius_m, reach_m(radius_m)), own_parts)
+
+
+def reach_m(radius_m: Float[ndarray, " keypoint"]) -> Float[ndarray, " keypoint"]:
+    """How far in front of a keypoint the surface of its own limb still shows it."""
+    return np.minimum(REACH * radius_m, radius_m + REACH_BEYOND_M)
 
 
 SMPL24_LIMBS = limbs(SMPL24_NAMES, SMPL24_PARTS)
@@ -69,22 +82,20 @@ def keypoint_visibility(
 ) -> Int8[ndarray, " keypoint"]:
     """0 outside the image circle or the image, 1 occluded, 2 visible.
 
-    The keypoint's pixel and its eight neighbours are asked (5 mm at 1.5 m): any of them that shows
-    the keypoint's own limb makes it visible, and so does the absence of any surface, which is the
-    case of a nose's tip beyond the outline.
+    The keypoint's own pixel decides. Where it shows no surface, any of its eight neighbours does;
+    where they show none either, nothing hides the keypoint (a nose's tip beyond the outline).
     """
     height, width = depth_m.shape
-    pixels = projected.pixels.numpy()
     in_view = projected.in_view.numpy()
-    centre = np.where(in_view[:, None], pixels, 0).astype(np.int64)  # floor: pixels are >= 0
-    offsets = np.arange(-1, 2)
-    u = np.clip(centre[:, 0, None] + np.tile(offsets, 3), 0, width - 1)
-    v = np.clip(centre[:, 1, None] + np.repeat(offsets, 3), 0, height - 1)
-    surface_m, part = depth_m[v, u], parts[v, u]
+    own_pixel = np.where(in_view[:, None], projected.pixels.numpy(), 0).astype(np.int64)
+    around = own_pixel[:, None] + NEIGHBOURS  # (keypoint, 9, 2); the first is the pixel itself
+    u, v = np.clip(around[..., 0], 0, width - 1), np.clip(around[..., 1], 0, height - 1)
+    surface_m, part = depth_m[v, u], parts[v, u].astype(np.int64)
 
     in_front_m = projected.distances_m.numpy()[:, None] - surface_m
-    own = np.take_along_axis(limbs.own_parts, part.astype(np.int64), axis=1)
-    shows = (in_front_m <= limbs.radius_m[:, None]) | (own & (in_front_m <= limbs.reach_m[:, None]))
-    empty = surface_m == 0
-    visible = (shows & ~empty).any(1) | empty.all(1)
+    own_limb = np.take_along_axis(limbs.own_parts, part, axis=1)
+    shows = in_front_m <= np.where(own_limb, limbs.reach_m[:, None], limbs.radius_m[:, None])
+    solid = surface_m > 0
+    near = (shows & solid).any(1) | ~solid.any(1)
+    visible = np.where(solid[:, 0], shows[:, 0], near)
     return np.where(in_view, np.where(visible, VISIBLE, OCCLUDED), OUTSIDE).astype(np.int8)

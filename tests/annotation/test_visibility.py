@@ -89,7 +89,7 @@ def test_the_own_or_an_adjacent_part_may_lie_further_in_front_but_not_anywhere()
         ("left_hip", 1.3 * radius, 2),
         ("left_ankle", 1.3 * radius, 2),
         ("right_knee", 1.3 * radius, 1),
-        ("left_knee", 2.0 * radius, 1),
+        ("left_knee", 2.5 * radius, 1),
     ):
         flesh = ((0.0, 0.0, depth - 0.3), 0.3, part)  # its top lies `depth` above the joint
         assert visibility_of("left_knee", (0.0, 0.0, 0.0), camera, flesh) == expected, part
@@ -190,7 +190,7 @@ def judged() -> list[tuple[str, int, int]]:
 
 
 def test_the_rule_agrees_with_the_surfaces_on_the_way(judged):
-    assert len(judged) > 150
+    assert len(judged) > 120
     assert min(sum(truth == value for *_, truth in judged) for value in (1, 2)) > 30
     wrong = [case for case in judged if case[1] != case[2]]
     assert len(wrong) / len(judged) <= 0.02, wrong

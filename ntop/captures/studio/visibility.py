@@ -2,7 +2,7 @@
 
 A ray from the camera towards the keypoint meets its first surface. The keypoint is visible if that
 surface is its own limb's: not further in front than the clothed limb's radius, measured on the rest
-body by rays from the keypoint; or of the same or an adjacent part and within `REACH` radii.
+body by rays towards the keypoint; or of the same or an adjacent part and within its reach.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from ntop.annotation.visibility import (
     COCO17_LIMBS,
     OCCLUDED,
     OUTSIDE,
-    REACH,
     SKIN_POINTS,
     SMPL24_LIMBS,
     VISIBLE,
     Limbs,
+    reach_m,
 )
 from ntop.body.skeletons import COCO17_NAMES, SMPL24_NAMES
 from ntop.captures.studio.actors import Actor
@@ -45,7 +45,8 @@ VISIBILITY = pa.schema(
         ("visibility_smpl24", vector(NUM_JOINTS, pa.int8())),
     ]
 )
-PROBES = 400  # rays from a keypoint that measure its limb
+PROBES = 400  # rays towards a keypoint that measure its limb
+PROBE_START_M = 0.3  # from it: outside the limb, short of the next one
 SKIN_SLACK_M = 0.02  # a point on the skin is hidden once more than this lies before it
 
 
@@ -94,7 +95,7 @@ def _visibility(
     own = limbs.own_parts[hits.ray, hit_parts(scene.actor, hits)]
     own &= limbs.reach_m[hits.ray] > limbs.radius_m[hits.ray]  # points on the skin have no reach
     radius = radius_m[hits.ray]
-    visible[hits.ray] = (in_front <= radius) | (own & (in_front <= REACH * radius))
+    visible[hits.ray] = (in_front <= radius) | (own & (in_front <= reach_m(radius)))
     return np.where(
         projected.in_view.numpy(), np.where(visible, VISIBLE, OCCLUDED), OUTSIDE
     ).astype(np.int8)
@@ -110,10 +111,12 @@ def _radii(
     directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], -1)
     radii = np.empty(len(points))
     for keypoint, (point, name) in enumerate(zip(points, names, strict=True)):
-        distance = mesh.first_hits(point, directions).distance_m
+        # from outside in: from inside, a head's rays would end at the mouth's cavity
+        hits = mesh.first_hits(point + PROBE_START_M * directions, -directions)
+        distance = PROBE_START_M - hits.distance_m
         kind = name.removeprefix("left_").removeprefix("right_")
         # along a limb the rays run far: the median is that of its cross-section
         radii[keypoint] = (
-            distance.min() + SKIN_SLACK_M if kind in SKIN_POINTS else np.median(distance)
+            np.abs(distance).min() + SKIN_SLACK_M if kind in SKIN_POINTS else np.median(distance)
         )
     return radii

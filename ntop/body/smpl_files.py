@@ -8,8 +8,8 @@ chumpy or scipy object becomes a plain holder of its attributes.
 import pickle
 import zipfile
 from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,7 +196,7 @@ class _ArrayUnpickler(pickle.Unpickler):
         raise DataError(f"refused to load {module}.{name}: not an array constructor; {_REMEDY}")
 
 
-def _unpickle(file: IO[bytes], path: Path) -> object:
+def _unpickle(file: BufferedIOBase, path: Path) -> object:
     try:
         return _ArrayUnpickler(file, encoding="latin1").load()
     except (pickle.UnpicklingError, EOFError, AttributeError, TypeError, ValueError) as error:
@@ -226,7 +226,7 @@ def _read_npz(path: Path) -> dict:
     return content
 
 
-def _read_npy(file: IO[bytes], path: Path) -> object:
+def _read_npy(file: BufferedIOBase, path: Path) -> object:
     version = np.lib.format.read_magic(file)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,

@@ -171,7 +171,7 @@ def _body_colours(actor: Actor, points: textures.Points) -> textures.Points:
     hair = np.zeros(len(points), points.dtype)
     hair[head] = textures.hair_weight(points[head], marks)
     dark, light = (
-        ((0.13, 0.08, 0.05), (0.50, 0.31, 0.17)) if plain else ((0.36, 0.13, 0.05), (0.85, 0.47, 0.20))
+        ((0.12, 0.07, 0.04), (0.66, 0.45, 0.26)) if plain else ((0.34, 0.11, 0.04), (0.93, 0.56, 0.27))
     )
     textures.layer(
         colours, points, weight=hair,

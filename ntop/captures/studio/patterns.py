@@ -86,5 +86,8 @@ def ripple(points_m: Float[ndarray, "*point 3"], *, wavelength_m: float, seed: i
 def paint(
     colours: Float[ndarray, "point 3"], weight: Float[ndarray, " point"], colour: Colour
 ) -> None:
-    """Lay a colour over the colours, in place."""
-    colours += weight[:, None] * (np.asarray(colour, dtype=colours.dtype) - colours)
+    """Lay a colour over the colours where the weight is positive, in place."""
+    chosen = np.flatnonzero(weight > 0)
+    below = colours[chosen]
+    below += weight[chosen, None] * (np.asarray(colour, dtype=colours.dtype) - below)
+    colours[chosen] = below

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 
@@ -21,6 +21,10 @@ class Hits:
     distance_m: Float[ndarray, " hit"]
     face: Int[ndarray, " hit"]
     weights: Float[ndarray, "hit 3"]
+
+    def only(self, kept: Bool[ndarray, " hit"]) -> "Hits":
+        """Some of the hits; `ray` still indexes the rays given."""
+        return Hits(self.ray[kept], self.distance_m[kept], self.face[kept], self.weights[kept])
 
     def interpolate(
         self, values: Float[ndarray, "vertex channel"], faces: Int[ndarray, "face 3"]

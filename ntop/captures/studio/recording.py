@@ -14,8 +14,8 @@ from ntop.geometry.cameras import Camera, Pinhole
 from ntop.geometry.rotations import matrix_from_axis_angle
 
 HEIGHTS_M = (1.0, 2.2, 1.4, 1.8)  # of the cameras, in turn around the ring
-TARGET_WORLD_M = (0.0, 0.0, 0.95)
-FOCAL_PER_SIZE = 1.05  # the image spans 2.5 m at the person's distance
+TARGET_WORLD_M = (0.0, 0.0, 1.0)
+FOCAL_PER_SIZE = 1.08  # the image spans 2.5 m at the person's distance
 LIMB_M = 0.4  # a joint error of one millimetre turns a bone of this length by 2.5 mrad
 
 

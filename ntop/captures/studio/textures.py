@@ -37,6 +37,9 @@ NTOP_LETTERS = {  # strokes in units of the letter height
 }  # fmt: skip
 
 
+CREAM, NAVY = (0.96, 0.94, 0.88), (0.06, 0.23, 0.45)
+
+
 @dataclass(frozen=True)
 class Landmarks:
     """Joints and keypoints of the shaped rest body (body frame, metres), by name."""
@@ -164,7 +167,7 @@ def _face(points: Points, colours: Points, marks: Landmarks) -> Points:
         brow = inside(np.minimum(0.0042 - np.abs(arch), 0.020 - np.abs(du)), 0.006)
         paint(colours, front * brow, (0.16, 0.10, 0.07))
     dv = y - (nose[1] - 0.036)
-    mouth = inside(1 - np.hypot(x / 0.027, (dv - 5 * x * x) / 0.0095), 0.6)
+    mouth = inside(1 - np.hypot(x / 0.024, (dv - 5 * x * x) / 0.0085), 0.45)
     paint(colours, front * mouth, (0.70, 0.27, 0.26))
     return colours
 
@@ -173,11 +176,13 @@ def hair(points: Points, marks: Landmarks, *, dark: Colour, light: Colour) -> Po
     """Strands that run from a parting over the crown, with lighter locks."""
     ear = 0.5 * (marks.keypoint("left_ear") + marks.keypoint("right_ear"))
     x, forward = points[:, 0] - 0.022, points[:, 2] - ear[2]
-    # noise that is fine from front to back and long over the sides: strands combed off the parting
-    combed = points * np.array([0.22, 0.22, 1.0], dtype=points.dtype)
-    locks = 0.5 + 0.5 * ripple(combed, wavelength_m=0.026, seed=5)
+    # strands run off the parting to both sides, in waves that slow noise bends and thins out
+    bend = 0.014 * ripple(points, wavelength_m=0.10, seed=5)
+    phase = (forward + bend + 0.15 * x) * (2 * np.pi / 0.034)
+    locks = 0.5 + 0.28 * np.sin(phase) + 0.22 * np.sin(1.62 * phase + 9 * x / 0.1)
+    slow = np.clip(0.65 + 0.5 * ripple(points, wavelength_m=0.09, seed=6), 0, 1)
     colours = plain_colour(points, dark)
-    paint(colours, np.clip(1.5 * locks - 0.4, 0, 1), light)
+    paint(colours, locks * slow, light)
     top = inside(points[:, 1] - marks.keypoint("left_eye")[1] - 0.07, 0.03)
     parting = inside(0.006 - np.abs(x), 0.009) * inside(forward + 0.05, 0.04) * top
     paint(colours, 0.75 * parting, (0.80, 0.62, 0.52))
@@ -192,36 +197,41 @@ def flannel(points: Points, marks: Landmarks) -> Points:
     for coordinate in (around, along):
         paint(colours, 0.72 * stripes(coordinate, period_m=period, width_m=0.036), (0.07, 0.09, 0.17))
     for coordinate in (around, along):
-        line = stripes(coordinate + period / 2, period_m=period, width_m=0.016)
-        paint(colours, 0.85 * line, (0.97, 0.88, 0.66))
-    front = inside(points[:, 2] - marks.joint("spine2")[2], 0.02)
+        line = stripes(coordinate + period / 2, period_m=period, width_m=0.021)
+        paint(colours, 0.92 * line, (0.98, 0.91, 0.72))
     chest_y = marks.joint("spine3")[1] + 0.07
-    _badge(colours, points[:, 0], points[:, 1] - chest_y, front)
-    _letters(colours, -points[:, 0], points[:, 1] - chest_y, 1 - front)
+    near = np.flatnonzero(
+        (np.abs(points[:, 1] - chest_y) < 0.09) & (np.abs(points[:, 0]) < 0.15)
+    )
+    u, v, z = points[near, 0], points[near, 1] - chest_y, points[near, 2]
+    front = inside(z - marks.joint("spine2")[2], 0.02)
+    printed = colours[near]
+    _badge(printed, u, v, front)
+    _letters(printed, -u, v, 1 - front)
+    colours[near] = printed
     return colours
 
 
 def _badge(colours: Points, u: Channel, v: Channel, weight: Channel) -> None:
     """A cream disc with the rig from above: a dot in the centre and eight around."""
     radius = np.hypot(u, v)
-    paint(colours, weight * inside(0.078 - radius), (0.96, 0.94, 0.88))
-    paint(colours, weight * inside(0.006 - np.abs(radius - 0.070)), (0.06, 0.23, 0.45))
-    angle = np.arctan2(v, u)
-    nearest = np.round(angle / (np.pi / 4)) * (np.pi / 4)
+    paint(colours, weight * inside(0.078 - radius), CREAM)
+    paint(colours, weight * inside(0.006 - np.abs(radius - 0.070)), NAVY)
+    nearest = np.round(np.arctan2(v, u) / (np.pi / 4)) * (np.pi / 4)
     ring = np.hypot(u - 0.045 * np.cos(nearest), v - 0.045 * np.sin(nearest))
-    paint(colours, weight * inside(0.0105 - ring), (0.06, 0.23, 0.45))
+    paint(colours, weight * inside(0.0105 - ring), NAVY)
     paint(colours, weight * inside(0.0145 - radius), (0.93, 0.42, 0.05))
 
 
 def _letters(colours: Points, u: Channel, v: Channel, weight: Channel) -> None:
     """A cream label with the letters NToP."""
-    paint(colours, weight * inside(box(u, v, half_size_m=(0.135, 0.062), radius_m=0.02)), (0.96, 0.94, 0.88))
+    label = box(u, v, half_size_m=(0.135, 0.062), radius_m=0.02)
+    paint(colours, weight * inside(label), CREAM)
     height, gap = 0.075, 0.24
-    width = sum(letter[0] for letter in NTOP_LETTERS.values()) + 3 * gap
-    left = -width / 2
+    left = -0.5 * (sum(letter[0] for letter in NTOP_LETTERS.values()) + 3 * gap)
     for letter_width, lines in NTOP_LETTERS.values():
         distance = strokes(u / height - left, v / height + 0.5, lines) * height
-        paint(colours, weight * inside(0.0075 - distance), (0.06, 0.23, 0.45))
+        paint(colours, weight * inside(0.0075 - distance), NAVY)
         left += letter_width + gap
 
 

@@ -5,11 +5,12 @@ even ambient, no cast shadows. Colours are shaded linearly and averaged as sRGB 
 picture this project composites.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from ntop.captures.studio.actors import Actor, PosedActor, albedo
@@ -18,7 +19,9 @@ from ntop.conventions import MASK_ALPHA
 from ntop.geometry.cameras import Camera
 
 BOX_MARGIN_PX = 2
-RAYS_PER_BLOCK = 1 << 21  # bounds memory; results do not depend on it
+RAYS_PER_BLOCK = 1 << 19  # bounds memory; results do not depend on it
+INNER_SAMPLES = 2  # per pixel and axis, away from outlines
+FLAT_M = 0.03  # a larger step in distance within a pixel is an outline
 
 
 @dataclass(frozen=True)
@@ -71,29 +74,31 @@ def light_actor(actor: Actor, posed: PosedActor, light: Light) -> Scene:
 
 
 def see(scene: Scene, camera: Camera, *, supersampling: int) -> View:
-    """The picture of one camera, `supersampling`^2 rays per covered or neighbouring pixel."""
+    """The picture of one camera.
+
+    Outlines, seen or occluding, get `supersampling`^2 rays per pixel, inner pixels at most
+    `INNER_SAMPLES`^2: textures and shading are smooth at that scale, outlines are not.
+    """
     width, height = camera.lens.width, camera.lens.height
-    rgb = np.zeros((height, width, 3), np.float32)
-    alpha = np.zeros((height, width), np.float32)
-    depth = np.zeros((height, width), np.float32)
-    parts = np.zeros((height, width), np.uint8)
-    pixels = _candidate_pixels(scene, camera)
-    count = supersampling**2
-    block = max(RAYS_PER_BLOCK // count, 1)
-    for start in range(0, len(pixels), block):
-        chosen = pixels[start : start + block]
-        colours, distance, labels, covered = _sample(scene, camera, chosen, supersampling)
-        v, u = chosen[:, 1], chosen[:, 0]
-        hits = covered.sum(1)
-        rgb[v, u] = colours.sum(1) / np.maximum(hits, 1)[:, None]
-        alpha[v, u] = hits / count
-        # the lower median is a surface that exists, a mean of two would float between them
-        order = np.argsort(np.where(covered, distance, np.inf), axis=1, kind="stable")
-        middle = np.take_along_axis(order, (np.maximum(hits, 1)[:, None] - 1) // 2, 1)
-        solid = np.rint(hits * 255 / count) >= MASK_ALPHA
-        depth[v, u] = np.where(solid, np.take_along_axis(distance, middle, 1)[:, 0], 0)
-        parts[v, u] = np.where(solid, np.take_along_axis(labels, middle, 1)[:, 0], 0)
-    return View(rgb, alpha, depth, parts)
+    view = View(
+        rgb=np.zeros((height, width, 3), np.float32),
+        alpha=np.zeros((height, width), np.float32),
+        depth_m=np.zeros((height, width), np.float32),
+        parts=np.zeros((height, width), np.uint8),
+    )
+    inner = min(supersampling, INNER_SAMPLES)
+    outline = []
+    for chosen in _blocks(_candidate_pixels(scene, camera), inner):
+        samples = _sample(scene, camera, chosen, inner)
+        flat = samples.covered.all(1) & (np.ptp(samples.distance_m, axis=1) < FLAT_M)
+        if supersampling == inner:
+            flat[:] = True
+        outline.append(chosen[~flat])
+        _fill(view, chosen[flat], scene=scene, samples=samples.only(flat))
+    for chosen in _blocks(np.concatenate(outline) if outline else None, supersampling):
+        samples = _sample(scene, camera, chosen, supersampling)
+        _fill(view, chosen, scene=scene, samples=samples)
+    return view
 
 
 def over(view: View, background: Float[ndarray, "height width 3"]) -> ndarray:
@@ -104,21 +109,24 @@ def over(view: View, background: Float[ndarray, "height width 3"]) -> ndarray:
 
 def hit_parts(actor: Actor, hits: Hits) -> UInt8[ndarray, " hit"]:
     """Part labels (bone + 1) at hit points: that of the nearest corner."""
-    nearest = hits.weights.argmax(1)
+    first, second, third = hits.weights.T
+    nearest = np.where(first >= np.maximum(second, third), 0, np.where(second >= third, 1, 2))
     return (actor.parts[actor.faces[hits.face, nearest]] + 1).astype(np.uint8)
 
 
 def shade(scene: Scene, hits: Hits, directions_world: Float[ndarray, "hit 3"]) -> ndarray:
     """sRGB colours of hit points, seen along the given unit directions."""
     actor, light = scene.actor, scene.light
-    points = hits.interpolate(actor.texture_points, actor.faces)
-    base = srgb_to_linear(albedo(actor, points, actor.surface[hits.face]))
-    normals = hits.interpolate(scene.posed.normals_world.astype(np.float32), actor.faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    # place and normal in one go: gathering corners is what costs
+    values = np.concatenate([actor.texture_points, scene.posed.normals_world], 1, dtype=np.float32)
+    at_hits = hits.interpolate(values, actor.faces)
+    points, normals = np.ascontiguousarray(at_hits[:, :3]), at_hits[:, 3:]
+    surface = actor.surface[hits.face]
+    base = srgb_to_linear(albedo(actor, points, surface))
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    lambert = normals @ light.towards_light_world.astype(np.float32) / np.maximum(length, 1e-9)
     # cloth has two sides: light the one that is seen
-    behind = (normals * directions_world).sum(1) > 0
-    inner = behind & (actor.surface[hits.face] > 0)
-    lambert = normals @ light.towards_light_world.astype(np.float32)
+    inner = (np.einsum("ij,ij->i", normals, directions_world) > 0) & (surface > 0)
     lambert = np.maximum(np.where(inner, -lambert, lambert), 0)
     return linear_to_srgb(base * (light.ambient + light.directional * lambert)[:, None])
 
@@ -134,32 +142,80 @@ def linear_to_srgb(light: Float[ndarray, "*shape"]) -> ndarray:
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
+@dataclass(frozen=True)
+class _Samples:
+    """Hits of a few pixels' rays; arrays are (pixel, sample), zero where nothing is hit."""
+
+    hits: Hits
+    directions_world: Float[ndarray, "ray 3"]
+    distance_m: Float[ndarray, "pixel sample"]
+    covered: Bool[ndarray, "pixel sample"]
+
+    def only(self, pixels: Bool[ndarray, " pixel"]) -> "_Samples":
+        """The samples of some of the pixels."""
+        per_pixel = self.covered.shape[1]
+        kept_rays = np.repeat(pixels, per_pixel)
+        kept = kept_rays[self.hits.ray]
+        new_index = np.cumsum(kept_rays) - 1
+        hits = Hits(
+            ray=new_index[self.hits.ray[kept]],
+            distance_m=self.hits.distance_m[kept],
+            face=self.hits.face[kept],
+            weights=self.hits.weights[kept],
+        )
+        return _Samples(
+            hits, self.directions_world[kept_rays], self.distance_m[pixels], self.covered[pixels]
+        )
+
+
 def _sample(
     scene: Scene, camera: Camera, pixels: Int[ndarray, "pixel 2"], supersampling: int
-) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Colour, distance, part and coverage of every sample of the given pixels: (pixel, sample)."""
+) -> _Samples:
+    """Cast a square grid of rays through each pixel (u, v indices)."""
     offsets = (np.arange(supersampling) + 0.5) / supersampling
     grid = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
-    places = (pixels[:, None, :] + grid[None]).reshape(-1, 2)
-    directions, valid = _rays(camera, places)
+    directions, valid = _rays(camera, (pixels[:, None, :] + grid[None]).reshape(-1, 2))
     hits = scene.mesh.first_hits(camera.center_world.numpy(), directions)
-    shape = (len(pixels), len(grid))
-    colours = np.zeros((len(places), 3), np.float32)
-    distance = np.zeros(len(places), np.float32)
-    labels = np.zeros(len(places), np.uint8)
-    covered = np.zeros(len(places), bool)
-    colours[hits.ray] = shade(scene, hits, directions[hits.ray])
+    if not valid.all():
+        hits = hits.only(valid[hits.ray])
+    distance = np.zeros(len(directions), np.float32)
+    covered = np.zeros(len(directions), bool)
     distance[hits.ray] = hits.distance_m
-    labels[hits.ray] = hit_parts(scene.actor, hits)
     covered[hits.ray] = True
-    outside = ~valid
-    covered[outside], colours[outside] = False, 0
-    return (
-        colours.reshape(*shape, 3),
-        distance.reshape(shape),
-        labels.reshape(shape),
-        covered.reshape(shape),
-    )
+    shape = (len(pixels), len(grid))
+    return _Samples(hits, directions, distance.reshape(shape), covered.reshape(shape))
+
+
+def _fill(view: View, pixels: Int[ndarray, "pixel 2"], *, scene: Scene, samples: _Samples) -> None:
+    """Resolve the samples of the pixels into the view, in place."""
+    if not len(pixels):
+        return
+    v, u = pixels[:, 1], pixels[:, 0]
+    hits, covered = samples.hits, samples.covered
+    colours = np.zeros((covered.size, 3), np.float32)
+    colours[hits.ray] = shade(scene, hits, samples.directions_world[hits.ray])
+    labels = np.zeros(covered.size, np.uint8)
+    labels[hits.ray] = hit_parts(scene.actor, hits)
+    labels = labels.reshape(covered.shape)
+    count = covered.sum(1)
+    total = np.einsum("psc->pc", colours.reshape(*covered.shape, 3))
+    view.rgb[v, u] = total / np.maximum(count, 1)[:, None]
+    view.alpha[v, u] = count / covered.shape[1]
+    # the lower median is a surface that exists, a mean of two would float between them
+    order = np.argsort(np.where(covered, samples.distance_m, np.inf), axis=1, kind="stable")
+    middle = np.take_along_axis(order, (np.maximum(count, 1)[:, None] - 1) // 2, 1)
+    solid = np.rint(count * 255 / covered.shape[1]) >= MASK_ALPHA
+    distance = np.take_along_axis(samples.distance_m, middle, 1)[:, 0]
+    view.depth_m[v, u] = np.where(solid, distance, 0)
+    view.parts[v, u] = np.where(solid, np.take_along_axis(labels, middle, 1)[:, 0], 0)
+
+
+def _blocks(pixels: Int[ndarray, "pixel 2"] | None, supersampling: int) -> Iterator[ndarray]:
+    """Runs of pixels whose rays fit into memory at once."""
+    if pixels is not None:
+        size = max(RAYS_PER_BLOCK // supersampling**2, 1)
+        for start in range(0, len(pixels), size):
+            yield pixels[start : start + size]
 
 
 def _candidate_pixels(scene: Scene, camera: Camera) -> Int[ndarray, "pixel 2"]:

@@ -174,7 +174,19 @@ class FitConfig(Section):
     """Section `fit`."""
 
     held_out_views: tuple[str, ...] = ()
-    refine_cameras: bool = True
+    refine_cameras: bool = Field(
+        default=True, description="Refine the extrinsics on the limbs' keypoints."
+    )
+    prior_weight: float = Field(
+        default=30.0, ge=0, description="Pixels per radian and metre that a camera moves."
+    )
+    loss_scale_px: float = Field(default=4.0, gt=0, description="Beyond, the loss is linear.")
+    outlier_px: float = Field(
+        default=25.0, gt=0, description="A camera that misses a point by more is left out."
+    )
+    min_confidence: float = Field(default=0.3, ge=0, le=1, description="Of a keypoint to count.")
+    landmark_spread_px: float = Field(default=6.0, gt=0, description="The detector's noise.")
+    silhouettes: bool = Field(default=True, description="Fit the mattes' borders as well.")
 
 
 class TrainConfig(Section):
@@ -208,7 +220,11 @@ class AssembleConfig(Section):
 
 
 class EvaluateConfig(Section):
-    """Section `evaluate`."""
+    """Section `evaluate`, completed by the workflow with the sources' held-out cameras."""
+
+    held_out_views: dict[str, tuple[str, ...]] = Field(
+        default_factory=dict, description="Source -> cameras that training never saw."
+    )
 
 
 STAGE_SECTIONS: dict[str, type[Section]] = {
@@ -231,6 +247,10 @@ class AssembleKeys(Section):
     """What the YAML may say about `assemble`; the workflow adds the rest."""
 
 
+class EvaluateKeys(Section):
+    """What the YAML may say about `evaluate`; the workflow adds the rest."""
+
+
 class Config(Section):
     """The whole configuration, as merged from the YAML files."""
 
@@ -245,7 +265,7 @@ class Config(Section):
     render: RenderConfig
     annotate: AnnotateConfig = AnnotateConfig()
     assemble: AssembleKeys = AssembleKeys()
-    evaluate: EvaluateConfig = EvaluateConfig()
+    evaluate: EvaluateKeys = EvaluateKeys()
 
 
 def read_config(merged: dict[str, Any]) -> Config:

@@ -4,7 +4,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ntop.report.charts import human
 from ntop.stages import STAGES
@@ -185,7 +185,16 @@ def figure(meaning: Meaning, value: float | None) -> Figure:
 def write_metrics(
     values: dict[str, float | None], *, by_actor: dict[str, dict[str, float | None]], path: Path
 ) -> None:
-    """Write `metrics.json`: the flat keys, and the same keys per actor where there are several."""
-    document = complete(values) | {"by_actor": by_actor}
+    """Write `metrics.json`: a dot in a key is a level; figures per actor lie below `by_actor`."""
+    document = _nested(complete(values))
+    document["by_actor"] = {actor: _nested(found) for actor, found in by_actor.items()}
     text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
     write_bytes(path, text.encode())
+
+
+def _nested(values: dict[str, float | None]) -> dict[str, Any]:
+    groups: dict[str, Any] = {}
+    for key, value in values.items():
+        group, name = key.split(".", 1)
+        groups.setdefault(group, {})[name] = value
+    return groups

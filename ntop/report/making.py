@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ntop.body.model import BodyModel
-from ntop.body.skinning import pose_body
 from ntop.conventions import MASK_ALPHA
 from ntop.report.capture import FrameKey, Recording
 from ntop.report.gallery import (
@@ -100,10 +99,9 @@ def _recorded_panels(
     action, frame, view = key
     photo, matte = recording.picture(key), recording.matte(key)
     camera, pose = recording.cameras[action, view], recording.pose((action, frame))
-    body = pose_body(model, pose)
     window = square_around(matte >= MASK_ALPHA / 255, margin=MARGIN)
     faded = with_matte(photo, np.zeros(matte.shape, np.uint8))
-    drawn = shaded_body(body.vertices, model.faces, camera)
+    drawn = shaded_body(model, pose, camera)
     overlaid = np.where(drawn[..., 3:] > 0, drawn, faded)
     return (
         Panel("Capture", f"{view}, {action} frame {frame}", window.of(photo)),

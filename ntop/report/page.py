@@ -64,8 +64,8 @@ class Page:
     provenance: tuple[tuple[str, str], ...]
     strips: tuple[Strip, ...] = ()
     sheets: tuple[Sheet, ...] = ()
-    heldout: Comparison | None = None
-    truth: Comparison | None = None
+    heldout: tuple[Comparison, ...] = ()
+    truth: tuple[Comparison, ...] = ()
     curves: tuple[str, ...] = ()  # SVG
     statistics: Table | None = None
     costs: tuple[str, ...] = ()  # SVG

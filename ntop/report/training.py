@@ -9,7 +9,11 @@ from ntop.conventions import DataError
 from ntop.report.charts import Line, line_chart
 from ntop.report.inputs import ActorFolders
 
-CURVES = {"loss": ("Training loss", "loss"), "psnr_db": ("Watched frames", "PSNR (dB)")}
+CURVES = {
+    "loss": ("Training loss", "loss"),
+    "psnr_person_db": ("Training rays on the person", "PSNR (dB)"),
+    "watched_psnr_db": ("Watched frames of the training cameras, never trained on", "PSNR (dB)"),
+}
 
 
 def training_charts(actors: list[ActorFolders]) -> tuple[str, ...]:

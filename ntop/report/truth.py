@@ -19,7 +19,7 @@ from ntop.report.pictures import Picture, error_colours, picture, square_around
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_image, score_table
 from ntop.storage import schemas
 from ntop.storage.images import read_rgba
-from ntop.storage.renders import fisheye_camera
+from ntop.storage.renders import fisheye_camera, set_key
 from ntop.storage.tables import Row, read_table
 
 PICTURE_MARGIN = 0.08
@@ -168,7 +168,8 @@ def _visibility_agreement(actor: ActorFolders, rows: list[Row]) -> float | None:
     path: Path = actor.capture / "truth" / "visibility.parquet"
     if not path.is_file():
         return None
-    truth = {row["sample_id"]: row for row in pq.read_table(path).to_pylist()}
+    table = pq.read_table(path).to_pylist()
+    truth = {set_key(row).sample_id(row["view"]): row for row in table}
     equal = total = 0
     for row in rows:
         for person in row["persons"]:

@@ -189,8 +189,9 @@ def write_truth(folder: Path, key: tuple[str, str]) -> None:
     s6_annotate.main(AnnotateConfig(), folder, folder / "labels.parquet")
     labels = {row["sample_id"]: row for row in pq.read_table(folder / "labels.parquet").to_pylist()}
     columns = ("visibility_coco17", "visibility_smpl24")
+    keys = ("source", "actor", "action", "rig", "frame", "view")
     table = [
-        {"sample_id": row["sample_id"]}
+        {name: row[name] for name in keys}
         | {name: labels[row["sample_id"]]["persons"][0][name] for name in columns}
         for row in rows
     ]
@@ -215,7 +216,11 @@ def world(tmp_path_factory) -> World:
         labels.append(annotations)
         avatar = root / "4_train" / place
         avatar.mkdir(parents=True)
-        curve = {"step": [1, 2, 3], "loss": [0.5, 0.3, 0.2], "psnr_db": [None, 20.0, 22.0]}
+        curve = {
+            "step": [1, 2, 3],
+            "loss": [0.5, 0.3, 0.2],
+            "watched_psnr_db": [float("nan"), 20.0, 22.0],
+        }
         pq.write_table(pa.table(curve), avatar / "curve.parquet")
         actors.append(ActorFolders(*key, capture, capture, capture, avatar))
     declared = tuple(

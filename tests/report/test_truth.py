@@ -1,16 +1,20 @@
 """Scores against truth and held-out cameras, where the answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ntop.metrics.images import PSNR_CEILING_DB
+from ntop.body.model import load_body_model
+from ntop.metrics.images import PSNR_CEILING_DB, mask_iou
 from ntop.report.capture import Recording
 from ntop.report.heldout import heldout_comparison, heldout_values, score_heldout
 from ntop.report.inputs import Dataset
+from ntop.report.mesh import painted_body
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_table
 from ntop.report.truth import score_truth, truth_comparison, truth_values
 
-from .conftest import cutout, painted
+from .conftest import cutout, painted, pose, side_cameras
 
 
 def scores(*box_db):
@@ -71,3 +75,25 @@ def test_means_and_tables():
     table = score_table({"a": scores(10), "b": scores(20, 30)}, first="rig")
     assert [row[:2] for row in table.rows] == [("a", "1"), ("b", "2"), ("all", "3")]
     assert table.rows[-1][3] == "20.00"
+
+
+def test_mean_part_colours_come_from_the_pictures(world):
+    recording = Recording(world.real)
+    model = load_body_model()
+    body = painted_body(recording, model, views={"cam01"})
+    labels = np.arange(24)
+    seen = [0, 3, 6, 9, 12, 15]  # trunk and head: surely in view
+    expected = labels / 30 + 0.1  # the small world's red
+    assert np.abs(body.colours[seen, 0] - expected[seen]).max() < 0.03
+    assert np.abs(body.colours[:, 2] - 0.4).max() < 0.01
+
+
+def test_the_painted_body_covers_what_rays_hit(world):
+    recording = Recording(world.real)
+    body = painted_body(recording, load_body_model(), views={"cam01"})
+    camera = side_cameras()["cam02"]
+    mask = body.cutout(pose(0), camera).mask
+    # drawn edges are half a sample wider than rays through pixel centres
+    assert mask_iou(mask, cutout(pose(0), camera).mask) > 0.85
+    away = replace(camera, center_world=camera.center_world + 50)
+    assert not body.cutout(pose(0), away).mask.any()

@@ -1,4 +1,14 @@
 # dataset, captures, avatars -> metrics and report
+def evaluate_params(wildcards):
+    """The section with every source's held-out cameras; the evaluation spans all sources."""
+    held_out = {
+        name: list(source.held_out_views)
+        for name, source in CONFIG.sources.items()
+        if source.held_out_views
+    }
+    return params_json("evaluate", None, {"held_out_views": held_out})
+
+
 rule evaluate:
     input:
         dataset="results/7_assemble/{dataset}",
@@ -18,7 +28,7 @@ rule evaluate:
     resources:
         mem_mb=4000,
     params:
-        config=stage_params("evaluate"),
+        config=evaluate_params,
         benchmarks="results/benchmarks",
     shell:
         "exec ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"

@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from ntop.conventions import DataError
-from ntop.geometry.cameras import Camera, Equidistant
+from ntop.geometry.cameras import Camera, Equidistant, Lens
 from ntop.geometry.rotations import cross_matrix, matrix_from_axis_angle
 from ntop.geometry.triangulation import Triangulation, camera_centers, triangulate
 
@@ -51,6 +51,11 @@ class Observations:
         )
 
 
+def pixels_per_radian(lens: Lens) -> float:
+    """Scale of a lens on its axis."""
+    return lens.focal if isinstance(lens, Equidistant) else 0.5 * (lens.fx + lens.fy)
+
+
 def observe(
     cameras: list[Camera],
     pixels: Float[Tensor, "point camera 2"],
@@ -62,8 +67,7 @@ def observe(
         direction, covered = camera.lens.unproject(pixels[:, index].double())
         bearings.append(direction)
         valid.append(covered)
-        lens = camera.lens
-        scale = lens.focal if isinstance(lens, Equidistant) else 0.5 * (lens.fx + lens.fy)
+        scale = pixels_per_radian(camera.lens)
         scales.append(torch.full((pixels.shape[0],), scale, dtype=torch.float64))
     seen = torch.stack(valid, -1)
     return Observations(

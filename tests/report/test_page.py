@@ -30,8 +30,7 @@ from ntop.report.pictures import (
 )
 from ntop.report.training import training_charts
 from ntop.storage.images import read_rgba
-
-from .conftest import cutout, pose, side_cameras
+from tests.report.small_world import cutout, pose, side_cameras
 
 
 def decoded(shown) -> np.ndarray:

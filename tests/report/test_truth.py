@@ -13,8 +13,7 @@ from ntop.report.inputs import Dataset
 from ntop.report.mesh import painted_body
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_table
 from ntop.report.truth import score_truth, truth_comparison, truth_values
-
-from .conftest import cutout, painted, pose, side_cameras
+from tests.report.small_world import cutout, painted, pose, side_cameras
 
 
 def scores(*box_db):

@@ -1,0 +1,206 @@
+"""Stage 8, evaluate: dataset, captures, avatars -> metrics.json and report.html."""
+
+import json
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ntop.body.model import BodyModel, load_body_model
+from ntop.body.skinning import BodyPose
+from ntop.config import EvaluateConfig
+from ntop.conventions import DataError
+from ntop.field.avatar import load_avatar
+from ntop.field.rendering import pose_avatar, render_view
+from ntop.geometry.cameras import Camera
+from ntop.metrics.images import Cutout
+from ntop.report.blobs import blob_max_px
+from ntop.report.capture import Recording
+from ntop.report.checks import check_masks, coco_self_ap, reprojection_max_px
+from ntop.report.figures import complete, figures, write_metrics
+from ntop.report.gallery import contact_sheet, representative_sets
+from ntop.report.heldout import (
+    ReferenceMasks,
+    Renderer,
+    heldout_comparison,
+    heldout_values,
+    score_heldout,
+)
+from ntop.report.inputs import ActorFolders, Dataset, actor_folders, stage_costs
+from ntop.report.making import making_strip
+from ntop.report.mesh import painted_body
+from ntop.report.page import Comparison, Page, Strip, write_page
+from ntop.report.summary import (
+    cost_charts,
+    headline,
+    lead,
+    provenance_rows,
+    read_dataset_record,
+    statistics_table,
+    tiles,
+)
+from ntop.report.training import training_charts
+from ntop.report.truth import score_truth, truth_comparison, truth_values
+from ntop.storage.atomic import atomic_folder
+
+KIB_PER_GB = 1024**2
+Values = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class ActorReport:
+    """What one actor adds to the metrics and the page."""
+
+    values: Values
+    strip: Strip
+    heldout: Comparison | None
+    truth: Comparison | None
+
+
+def main(
+    config: EvaluateConfig,
+    dataset: Path,
+    captures: list[Path],
+    mattes: list[Path],
+    bodies: list[Path],
+    avatars: list[Path],
+    benchmarks: Path,
+    out: Path,
+) -> None:
+    """Write metrics.json and report.html into `out`.
+
+    `captures`, `mattes`, `bodies` and `avatars` hold one folder `.../{source}/{actor}` per actor,
+    in one order; `benchmarks` is the folder of Snakemake's benchmark tables.
+
+    Raises:
+        DataError: a result is missing or damaged, or the folders name different actors.
+    """
+    started = time.monotonic()
+    actors = actor_folders(captures, mattes=mattes, bodies=bodies, avatars=avatars)
+    assembled = Dataset.read(dataset)
+    model = load_body_model()
+    reports = {actor.name: report_actor(config, assembled, actor, model=model) for actor in actors}
+    values = mean_values([report.values for report in reports.values()])
+    values |= dataset_values(assembled)
+    values |= stage_costs(benchmarks)
+    values |= own_costs(started)
+    page = compose(assembled, actors, reports=reports, values=complete(values))
+    with atomic_folder(out) as folder:
+        by_actor = {name: report.values for name, report in reports.items()}
+        write_metrics(values, by_actor=by_actor, path=folder / "metrics.json")
+        write_page(page, folder / "report.html")
+
+
+def report_actor(
+    config: EvaluateConfig, dataset: Dataset, actor: ActorFolders, *, model: BodyModel
+) -> ActorReport:
+    """Scores and pictures of one actor."""
+    recording = Recording(actor)
+    held_out = set(config.held_out_views.get(actor.source, ()))
+    render = avatar_renderer(actor, model)
+    seen = {view for _, _, view in recording.mattes} - held_out
+    paint = painted_body(recording, model, views=seen).cutout
+    values = fit_values(actor)
+    heldout = truth = None
+    references = reference_masks(recording, held_out)
+    found = score_heldout(recording, references, render=render, paint=paint)
+    if found is not None:
+        values |= heldout_values(found)
+        heldout = heldout_comparison(
+            recording, found, references=references, render=render, paint=paint
+        )
+    true = score_truth(dataset, actor, paint=paint)
+    if true is not None:
+        values |= truth_values(true)
+        truth = truth_comparison(dataset, actor, true, paint=paint)
+    strip = making_strip(dataset, recording, model=model, render=render)
+    return ActorReport(values, strip, heldout, truth)
+
+
+def reference_masks(recording: Recording, held_out: set[str]) -> ReferenceMasks:
+    """Hand-checked masks of the held-out cameras' frames."""
+    return {}
+
+
+def avatar_renderer(actor: ActorFolders, model: BodyModel) -> Renderer:
+    """The actor's avatar as a function of pose and camera."""
+    avatar = load_avatar(actor.avatar)
+
+    def render(pose: BodyPose, camera: Camera) -> Cutout:
+        rendering = render_view(pose_avatar(avatar, model, pose), camera)
+        return Cutout(rendering.rgb.astype(np.float64), rendering.alpha.astype(np.float64))
+
+    return render
+
+
+def fit_values(actor: ActorFolders) -> Values:
+    """What the fit stage measured of itself; nothing where the bodies were given."""
+    path = actor.bodies / "scores.json"
+    if not path.is_file():
+        return {}
+    try:
+        scores = json.loads(path.read_text())
+    except ValueError as error:
+        raise DataError(f"{path} is not JSON: {error}; rerun the fit stage") from error
+    return {key: value for key, value in scores.items() if "." in key}
+
+
+def dataset_values(dataset: Dataset) -> Values:
+    """Figures of the dataset as a whole."""
+    checks = check_masks(dataset)
+    return {
+        "labels.blob_max_px": blob_max_px(dataset),
+        "labels.reprojection_max_px": reprojection_max_px(dataset),
+        "dataset.images": len(dataset.rows),
+        "checks.coco_self_ap": coco_self_ap(dataset),
+        "checks.rle_equals_mask": checks.rle_equals_mask,
+        "checks.visible_on_mask": checks.visible_on_mask,
+    }
+
+
+def mean_values(by_actor: list[Values]) -> Values:
+    """Each figure's mean over the actors that have it."""
+    keys = sorted({key for values in by_actor for key in values})
+    means: Values = {}
+    for key in keys:
+        known = [values[key] for values in by_actor if values.get(key) is not None]
+        means[key] = float(np.mean(known)) if known else None
+    return means
+
+
+def own_costs(started: float) -> Values:
+    """This stage's own time and memory so far: its benchmark is written after it has ended."""
+    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "seconds.evaluate": round(time.monotonic() - started, 3),
+        "peak_memory_gb.evaluate": round(peak_kib / KIB_PER_GB, 4),
+    }
+
+
+def compose(
+    dataset: Dataset,
+    actors: list[ActorFolders],
+    *,
+    reports: dict[str, ActorReport],
+    values: Values,
+) -> Page:
+    """The page of all actors."""
+    record = read_dataset_record(dataset)
+    keys = [key for actor in actors for key in representative_sets(dataset, actor).values()]
+    return Page(
+        title=f"{dataset.name} · ntop report",
+        headline=headline(dataset),
+        lead=lead(dataset),
+        tiles=tiles(values),
+        figures=tuple(figures(values)),
+        provenance=provenance_rows(record, actors),
+        strips=tuple(report.strip for report in reports.values()),
+        sheets=tuple(contact_sheet(dataset, key, index=i) for i, key in enumerate(keys)),
+        heldout=tuple(r.heldout for r in reports.values() if r.heldout is not None),
+        truth=tuple(r.truth for r in reports.values() if r.truth is not None),
+        curves=training_charts(actors),
+        statistics=statistics_table(record),
+        costs=cost_charts(values),
+    )

@@ -1,0 +1,83 @@
+"""The stage as a whole: every key, the values that are known, one page with every section."""
+
+import json
+import re
+
+import pytest
+
+from ntop.config import EvaluateConfig
+from ntop.conventions import DataError
+from ntop.report.figures import ALWAYS
+from ntop.stages import s8_evaluate
+from tests.report.small_world import World, build_world
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> World:
+    return build_world(tmp_path_factory.mktemp("evaluate"))
+
+
+def run(world, out, **changes):
+    folders = {
+        "captures": [actor.capture for actor in world.actors],
+        "mattes": [actor.mattes for actor in world.actors],
+        "bodies": [actor.bodies for actor in world.actors],
+        "avatars": [actor.avatar for actor in world.actors],
+        "dataset": world.dataset,
+    }
+    s8_evaluate.main(
+        EvaluateConfig(held_out_views={"real": ["cam02"]}),
+        benchmarks=world.benchmarks,
+        out=out,
+        **(folders | changes),
+    )
+
+
+@pytest.fixture(scope="module")
+def results(world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("results") / "8_evaluate" / "tiny"
+    run(world, out)
+    return out
+
+
+def test_metrics_hold_every_key_and_the_known_values(results):
+    metrics = json.loads((results / "metrics.json").read_text())
+    for key in ALWAYS:
+        group, name = key.split(".")
+        assert name in metrics[group], key
+    assert metrics["truth"]["psnr_person_db"] == pytest.approx(20, abs=0.1)
+    assert metrics["truth"]["mask_iou"] == 1
+    assert metrics["truth"]["visibility_agreement"] == 1
+    assert metrics["labels"]["blob_max_px"] <= 0.05
+    assert metrics["labels"]["reprojection_max_px"] <= 1e-9
+    assert metrics["dataset"]["images"] == 36
+    assert metrics["fit"] == {"joint_error_mm": 21.5, "mask_iou": 0.9}
+    assert metrics["refine_cameras"] == {"before_px": None, "heldout_px": None}
+    # nobody checked masks of this actor by hand: nothing is invented
+    assert set(metrics["heldout"].values()) == {None}
+    assert metrics["checks"]["rle_equals_mask"] == 1
+    assert metrics["checks"]["coco_self_ap"] == pytest.approx(1)
+    assert metrics["seconds"]["train"] == 22
+    assert metrics["seconds"]["render"] is None
+    assert metrics["seconds"]["evaluate"] > 0
+    assert metrics["by_actor"]["real/p00"]["fit"]["mask_iou"] == 0.9
+    assert "truth" not in metrics["by_actor"]["real/p00"]
+
+
+def test_the_report_is_one_file_with_its_sections(results):
+    assert sorted(path.name for path in results.iterdir()) == ["metrics.json", "report.html"]
+    page = (results / "report.html").read_text()
+    anchors = re.findall(r'<section id="(\w+)"', page)
+    assert anchors == [
+        "making", "views", "truth", "training", "statistics", "figures", "costs", "provenance",
+    ]  # fmt: skip
+    assert len(re.findall(r"<img ", page)) == 2 * 6 + 2 * (9 + 4) + 3 * 4
+    assert "http:" not in page and "https:" not in page
+
+
+def test_a_missing_or_foreign_folder_is_an_error(world, tmp_path):
+    with pytest.raises(DataError, match="one order"):
+        run(world, tmp_path / "out", avatars=[actor.avatar for actor in world.actors][::-1])
+    with pytest.raises(DataError, match="cannot read table"):
+        run(world, tmp_path / "out", dataset=tmp_path / "nothing")
+    assert not (tmp_path / "out").exists()

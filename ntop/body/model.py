@@ -47,6 +47,11 @@ class BodyModel:
         )
 
     @cached_property
+    def offsets_per_beta(self) -> Float[Tensor, "beta vertex 3"]:
+        """`shapedirs` with the numbers of one beta side by side in memory, for skinning."""
+        return self.shapedirs.movedim(-1, 0).contiguous()
+
+    @cached_property
     def joint_template(self) -> Float[Tensor, "joint 3"]:
         """Rest joints at betas = 0."""
         return self.joint_regressor @ self.v_template

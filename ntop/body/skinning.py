@@ -89,15 +89,28 @@ def coco17_points(
 def _shaped_vertices(
     model: BodyModel, betas: Float[Tensor, "*batch beta"]
 ) -> Float[Tensor, "*batch vertex 3"]:
-    offsets = betas @ model.shapedirs.flatten(0, 1).mT
-    return model.v_template + offsets.unflatten(-1, (-1, 3))
+    return _add_shape(model.v_template, model.offsets_per_beta, betas)
 
 
 def _rest_joints(
     model: BodyModel, betas: Float[Tensor, "*batch beta"]
 ) -> Float[Tensor, "*batch 24 3"]:
-    offsets = betas @ model.joint_shapedirs.flatten(0, 1).mT
-    return model.joint_template + offsets.unflatten(-1, (-1, 3))
+    return _add_shape(model.joint_template, model.joint_shapedirs.movedim(-1, 0), betas)
+
+
+def _add_shape(
+    template: Float[Tensor, "point 3"],
+    offsets_per_beta: Float[Tensor, "beta point 3"],
+    betas: Float[Tensor, "*batch beta"],
+) -> Float[Tensor, "*batch point 3"]:
+    """Template plus shape offsets, one beta after the other.
+
+    As one matrix product the rounding would change with the number of threads [measured].
+    """
+    shaped = template.expand(*betas.shape[:-1], *template.shape).clone()
+    for beta, offsets in zip(betas.unbind(-1), offsets_per_beta, strict=True):
+        shaped.addcmul_(beta[..., None, None], offsets)
+    return shaped
 
 
 def _joint_rotations(pose: BodyPose) -> Float[Tensor, "*batch 24 3 3"]:

@@ -180,3 +180,27 @@ def test_bending_the_left_elbow_moves_the_left_forearm_only():
     weight = model.lbs_weights[:, [18, 20, 22]].sum(-1)
     assert (moved <= (weight > 0)).all()
     assert moved[weight > 0.5].all()
+
+
+@pytest.fixture
+def thread_count():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("frames", [3, 9, 40])
+def test_bytes_do_not_depend_on_threads_or_on_the_batch(thread_count, frames):
+    model, pose = load_body_model(), random_pose(frames, dtype=torch.float32)
+    posed = []
+    for threads in (1, 2, 4):
+        thread_count(threads)
+        posed.append(pose_body(model, pose))
+    single = BodyPose(*(getattr(pose, name)[1] for name in pose.__dataclass_fields__))
+    alone = pose_body(model, single)
+    for other in posed[1:]:
+        assert torch.equal(other.vertices, posed[0].vertices)
+        assert torch.equal(other.joints, posed[0].joints)
+        points = coco17_points(model, other.vertices)
+        assert torch.equal(points, coco17_points(model, posed[0].vertices))
+    assert torch.equal(posed[0].vertices[1], alone.vertices)

@@ -1,15 +1,16 @@
 """The person as what differs from the empty scene: background subtraction with soft edges.
 
-For a fixed camera and a plate (a picture of the empty scene, or the temporal median where the person
-moves enough). Colours mix linearly at an edge, I = a F + (1 - a) B; with B from the plate and F from
-the person just inside, the matte a is one projection per pixel.
+For a fixed camera and a plate: a picture of the empty scene, or the temporal median where the
+person moves enough. Colours mix linearly at an edge, I = a F + (1 - a) B; with B from the plate and
+F from the person just inside, the matte a is one projection per pixel.
 """
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from ntop.masks.mattes import box_around, fill_small_holes
+from ntop.masks.mattes import fill_small_holes
+from ntop.masks.regions import box_around
 
 MIN_DIFFERENCE = 0.04  # colour distance (of [0, 1] per channel) that counts whatever the noise
 NOISE_FACTOR = 6.0  # standard deviations of the scene's noise that count as a difference

@@ -15,7 +15,14 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from ntop.masks.consensus import MIRRORED, agree
 from ntop.masks.network import Network
-from ntop.masks.regions import Region, crop_region, region_of_person, transform_points, warp_back
+from ntop.masks.regions import (
+    Region,
+    box_around,
+    crop_region,
+    region_of_person,
+    transform_points,
+    warp_back,
+)
 
 SIZE = 256
 NUM_LANDMARKS, NUM_KEYPOINTS = 39, 33  # six auxiliary landmarks follow the 33 keypoints
@@ -47,7 +54,8 @@ class Pose:
 
     `landmarks_px` are the 33 keypoints and the two points of his circle. `votes` says per group
     (head, arms, legs) how many more looks named left and right as here than the other way round;
-    `person` is the probability image in the frame's pixels, `agreement` the mean intersection over
+    `person` is the probability image in the frame's pixels, in 1/255, inside `box` (zero
+    outside), of a frame of `shape` (height, width); `agreement` the mean intersection over
     union of the looks' masks with theirs together, `next_region` where he is now.
     """
 
@@ -56,9 +64,17 @@ class Pose:
     confidence: Float[np.ndarray, " 35"]
     votes: Int[np.ndarray, " 3"]
     pose_score: float
-    person: Float32[np.ndarray, "height width"]
+    person: UInt8[np.ndarray, "rows columns"]
+    box: tuple[slice, slice]
+    shape: tuple[int, int]
     agreement: float
     next_region: Region
+
+    def person_in_frame(self) -> UInt8[np.ndarray, "height width"]:
+        """The probability image as large as the frame."""
+        whole = np.zeros(self.shape, np.uint8)
+        whole[self.box] = self.person
+        return whole
 
 
 def sigmoid(logits: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -139,8 +155,10 @@ def estimate_pose(
             scores.append(answer.pose_score)
             people.append(warp_back(answer.person, turned, shape=image.shape[:2]))
     found = agree(np.array(points), np.array(confidences), before_px, side_px=region.side_px)
-    person = np.clip(np.mean(people, axis=0, dtype=np.float32), 0, 1)
-    together = person >= 0.5
+    mean = np.mean(people, axis=0, dtype=np.float32)
+    person = np.rint(255 * np.clip(mean, 0, 1)).astype(np.uint8)
+    box = box_around(person > 0, margin_px=0) or (slice(0, 1), slice(0, 1))
+    together = mean >= 0.5
     agreement = np.mean([intersection_over_union(one >= 0.5, together) for one in people])
     return Pose(
         region=region,
@@ -148,7 +166,9 @@ def estimate_pose(
         confidence=found.confidence,
         votes=found.votes,
         pose_score=float(np.mean(scores)),
-        person=person,
+        person=person[box].copy(),
+        box=box,
+        shape=person.shape,
         agreement=float(agreement),
         next_region=region_of_person(found.landmarks_px[HIP], found.landmarks_px[FULL_BODY]),
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from ntop.conventions import PIXEL_CENTRE
 
@@ -109,4 +109,17 @@ def warp_back(
         (shape[1], shape[0]),
         flags=cv2.INTER_CUBIC,
         borderMode=cv2.BORDER_CONSTANT,
+    )
+
+
+def box_around(
+    mask: Bool[np.ndarray, "height width"], *, margin_px: int
+) -> tuple[slice, slice] | None:
+    """The mask's bounding box with a margin, clipped to the image; None for an empty mask."""
+    rows, columns = mask.any(1).nonzero()[0], mask.any(0).nonzero()[0]
+    if not len(rows):
+        return None
+    return (
+        slice(max(0, int(rows[0]) - margin_px), int(rows[-1]) + 1 + margin_px),
+        slice(max(0, int(columns[0]) - margin_px), int(columns[-1]) + 1 + margin_px),
     )

@@ -7,8 +7,9 @@ from jaxtyping import Float, Float32, UInt8
 
 from ntop.conventions import MASK_ALPHA
 from ntop.masks.background import subtract_background
-from ntop.masks.landmarks import NUM_KEYPOINTS, SIZE
+from ntop.masks.landmarks import NUM_KEYPOINTS, SIZE, Pose
 from ntop.masks.mattes import MIN_POINT_CONFIDENCE, keep_person, sharpen_matte
+from ntop.masks.plates import Plate
 from ntop.masks.tracking import Sighting
 
 RADIUS_CROP_PX = 2  # reach of the edge correction, in pixels of the network's crop
@@ -27,27 +28,36 @@ class Segmentation:
     reason: str
 
 
-def segment_person(image: Image, sighting: Sighting) -> Segmentation:
+def edge_radius_px(pose: Pose) -> int:
+    """How far the network's mask may be off in the frame."""
+    return max(1, round(RADIUS_CROP_PX * pose.region.side_px / SIZE))
+
+
+def segment_person(image: Image, sighting: Sighting, *, plate: Plate | None) -> Segmentation:
     """The matte of the person the pose network sees, edges on the picture's edges."""
     pose = sighting.pose
     if pose is None:
-        return _unusable(image, sighting.reason)
-    radius_px = max(1, round(RADIUS_CROP_PX * pose.region.side_px / SIZE))
-    matte = sharpen_matte(image, pose.person, radius_px=radius_px)
+        return unusable(image.shape[:2], sighting.reason)
+    radius_px = edge_radius_px(pose)
+    matte = sharpen_matte(image, pose.person_in_frame(), plate=plate, radius_px=radius_px)
     points, confidence = pose.landmarks_px[:NUM_KEYPOINTS], pose.confidence[:NUM_KEYPOINTS]
     matte = keep_person(matte, points, confidence, radius_px=radius_px)
     if not has_person(matte):
-        return _unusable(image, "empty mask")
+        return unusable(image.shape[:2], "empty mask")
     share = share_on_mask(matte, points, confidence)
     if share < MIN_ON_MASK:
-        return _unusable(image, f"only {share:.0%} of the keypoints lie on the mask")
+        return unusable(image.shape[:2], f"only {share:.0%} of the keypoints lie on the mask")
     return Segmentation(matte, pose.pose_score * pose.agreement, "")
 
 
 def segment_difference(image: Image, plate: Image) -> Segmentation:
     """The matte of what stands in front of the empty scene."""
     matte = subtract_background(image, plate)
-    return Segmentation(matte, 1.0, "") if has_person(matte) else _unusable(image, "empty mask")
+    return (
+        Segmentation(matte, 1.0, "")
+        if has_person(matte)
+        else unusable(image.shape[:2], "empty mask")
+    )
 
 
 def has_person(matte: Float32[np.ndarray, "height width"]) -> bool:
@@ -60,7 +70,7 @@ def share_on_mask(
     keypoints_px: Float[np.ndarray, "n 2"],
     confidence: Float[np.ndarray, " n"],
 ) -> float:
-    """The share of confident keypoints inside the image that lie on the mask; 1 if there is none."""
+    """The share of the confident keypoints that lie on the mask; 1 if there are none."""
     height, width = matte.shape
     u, v = np.floor(keypoints_px).astype(int).T
     usable = (confidence >= MIN_POINT_CONFIDENCE) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -72,5 +82,6 @@ def share_on_mask(
     return float(np.mean(hits)) if hits else 1.0
 
 
-def _unusable(image: Image, reason: str) -> Segmentation:
-    return Segmentation(np.zeros(image.shape[:2], np.float32), 0.0, reason)
+def unusable(shape: tuple[int, int], reason: str) -> Segmentation:
+    """An empty matte of (height, width) and why."""
+    return Segmentation(np.zeros(shape, np.float32), 0.0, reason)

@@ -12,7 +12,7 @@ confidence 0, and a row with the reason.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
@@ -28,11 +28,14 @@ from ntop.masks.background import temporal_median
 from ntop.masks.consensus import GROUPS, naming
 from ntop.masks.landmarks import NUM_KEYPOINTS
 from ntop.masks.network import Network
+from ntop.masks.plates import Plate, PlateBuilder
 from ntop.masks.segmentation import (
     Segmentation,
+    edge_radius_px,
     has_person,
     segment_difference,
     segment_person,
+    unusable,
 )
 from ntop.masks.tracking import Networks, Sighting, follow_person
 from ntop.storage import schemas
@@ -44,6 +47,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 
 SKELETON = "mediapipe33"
 KEY = ("source", "actor", "action", "frame", "view")
+PLATE_FRAMES = 50  # of a view, evenly spread, to piece the scene together from
 MEDIAN_FRAMES = 25  # of a view, evenly spread, for a plate by temporal median
 
 
@@ -90,50 +94,76 @@ def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
         done = list(pool.map(lambda view: process_view(job, view), views))
     masks = [mask for view, _ in done for mask in view]
     points = [point for _, view in done for point in view]
-    reasons = [mask["reason"] for mask in masks]
     if job.wants_masks:
         if all(mask["confidence"] == 0 for mask in masks):
-            raise DataError(_nothing_usable(capture, "mask", reasons))
+            reasons = "; ".join(sorted({mask["reason"] for mask in masks})[:3])
+            raise DataError(_nothing_usable(capture, f"mask ({reasons})"))
         write_table(masks, schema=schemas.MASK, path=out / "masks.parquet")
     if job.wants_keypoints:
         if not any(any(point["confidence"]) for point in points):
-            raise DataError(_nothing_usable(capture, "keypoint", reasons))
+            raise DataError(_nothing_usable(capture, "keypoint"))
         write_table(points, schema=schemas.KEYPOINTS2D, path=out / "keypoints2d.parquet")
 
 
 def process_view(job: Job, rows: list[Row]) -> tuple[list[Row], list[Row]]:
-    """Mask and keypoint rows of one view's frames, followed in time; writes the mattes."""
+    """Mask and keypoint rows of one view's frames; writes the mattes.
+
+    The frames are decoded twice: to follow the person and learn what is behind him, then to
+    segment.
+    """
     usable = [row for row in rows if not row["reason"]]
-    networks = _load_networks(job)
-    by_plate = job.wants_masks and job.config.method == "background" and usable
-    plate = _read_plate(job, usable) if by_plate else None
-    masks, points, last = [], [], None
-    votes = np.zeros(len(GROUPS), int)
-    for row, image in _in_time(job, usable):
-        sighting = follow_person(networks, image, last) if networks else Sighting(None, "")
-        if sighting.pose:
-            last, votes = sighting.pose, votes + sighting.pose.votes
-        if plate is None:
-            found = segment_person(image, sighting)
-        else:
-            found = segment_difference(image, plate)
-        masks.append(_mask_row(job, row, found))
-        points.append(_keypoint_row(row, sighting))
+    sightings, plate = _follow(job, usable)
+    votes = sum((s.pose.votes for s in sightings if s.pose), np.zeros(len(GROUPS), int))
+    # continuity named left and right alike in all frames; the majority of all looks says which
+    order = naming(votes < 0)[:NUM_KEYPOINTS]
+    points = [_keypoint_row(row, s, order) for row, s in zip(usable, sightings, strict=True)]
+    masks = []
+    if job.wants_masks:
+        segment = _segmenter(job, usable, plate)
+        frames = zip(_in_time(job, usable), sightings, strict=True)
+        masks = [_mask_row(job, row, segment(image, s)) for (row, image), s in frames]
     for row in rows:
         if row["reason"]:
-            empty = np.zeros((row["height"], row["width"]), np.float32)
-            masks.append(_mask_row(job, row, Segmentation(empty, 0.0, row["reason"])))
-            points.append(_keypoint_row(row, Sighting(None, "")))
-    # continuity named left and right alike in all frames; the majority of all looks says which
-    return masks, [_renamed(point, naming(votes < 0)[:NUM_KEYPOINTS]) for point in points]
+            lost = Sighting(None, row["reason"])
+            points.append(_keypoint_row(row, lost, order))
+            if job.wants_masks:
+                shape = (row["height"], row["width"])
+                masks.append(_mask_row(job, row, unusable(shape, lost.reason)))
+    return masks, points
 
 
-def _load_networks(job: Job) -> Networks | None:
-    """The pose networks, one pair per view (an interpreter is not thread-safe), if needed."""
-    if not job.wants_keypoints and job.config.method != "mediapipe":
-        return None
+def _follow(job: Job, rows: list[Row]) -> tuple[list[Sighting], Plate | None]:
+    """The person in every frame of a view, in time, and the scene behind him.
+
+    Without need for the network nobody is sought, and the scene is unknown.
+    """
+    if not rows or not (job.wants_keypoints or job.config.method == "mediapipe"):
+        return [Sighting(None, "")] * len(rows), None
     detector, landmarks = job.config.detector, job.config.landmarks
-    return Networks(Network(job.packages / detector), Network(job.packages / landmarks))
+    networks = Networks(Network(job.packages / detector), Network(job.packages / landmarks))
+    scene = PlateBuilder((rows[0]["height"], rows[0]["width"]))
+    stride = max(1, len(rows) // PLATE_FRAMES)
+    sightings, last = [], None
+    for index, (_, image) in enumerate(_in_time(job, rows)):
+        sighting = follow_person(networks, image, last)
+        sightings.append(sighting)
+        last = sighting.pose or last
+        if sighting.pose and index % stride == 0:
+            person = sighting.pose.person_in_frame()
+            scene.add(image, person, radius_px=edge_radius_px(sighting.pose))
+    return sightings, scene.finish()
+
+
+def _segmenter(
+    job: Job, rows: list[Row], plate: Plate | None
+) -> Callable[[Picture, Sighting], Segmentation]:
+    """How a frame of this view is segmented, by the configured method."""
+    match job.config.method:
+        case "mediapipe":
+            return lambda image, sighting: segment_person(image, sighting, plate=plate)
+        case "background":
+            scene = _read_plate(job, rows)
+            return lambda image, _: segment_difference(image, scene)
 
 
 def _in_time(job: Job, rows: list[Row]) -> Iterator[tuple[Row, Picture]]:
@@ -158,14 +188,13 @@ def _read_plate(job: Job, rows: list[Row]) -> Picture:
 
 
 def _mask_row(job: Job, row: Row, found: Segmentation) -> Row:
-    """The row of a frame's matte, computed or corrected by hand; writes it if masks are wanted."""
+    """The row of a frame's matte, computed or corrected by hand; writes the matte."""
     name = f"{row['action']}/{row['view']}/{row['frame']:06d}.png"
     method = job.config.method
     corrected = Path(job.config.overrides) / name if job.config.overrides else None
     if corrected is not None and corrected.exists():
         found, method = _read_override(corrected, row), "manual"
-    if job.wants_masks:
-        write_matte(found.matte, path=job.out / "masks" / name)
+    write_matte(found.matte, path=job.out / "masks" / name)
     return {key: row[key] for key in KEY} | {
         "mask_path": f"masks/{name}",
         "confidence": found.confidence,
@@ -187,10 +216,11 @@ def _read_override(path: Path, row: Row) -> Segmentation:
     return Segmentation(matte, 0.0, "empty mask, by hand")
 
 
-def _keypoint_row(row: Row, sighting: Sighting) -> Row:
+def _keypoint_row(row: Row, sighting: Sighting, order: np.ndarray) -> Row:
+    """The row of a frame's keypoints, `order` naming left and right."""
     pose = sighting.pose
-    landmarks = np.zeros((NUM_KEYPOINTS, 2)) if pose is None else pose.landmarks_px[:NUM_KEYPOINTS]
-    confidence = np.zeros(NUM_KEYPOINTS) if pose is None else pose.confidence[:NUM_KEYPOINTS]
+    landmarks = np.zeros((NUM_KEYPOINTS, 2)) if pose is None else pose.landmarks_px[order]
+    confidence = np.zeros(NUM_KEYPOINTS) if pose is None else pose.confidence[order]
     return {key: row[key] for key in KEY} | {
         "skeleton": SKELETON,
         "keypoints_px": landmarks.ravel().tolist(),
@@ -198,17 +228,8 @@ def _keypoint_row(row: Row, sighting: Sighting) -> Row:
     }
 
 
-def _renamed(row: Row, order: np.ndarray) -> Row:
-    """The keypoints in another order."""
-    points = np.array(row["keypoints_px"]).reshape(-1, 2)[order]
-    confidence = np.array(row["confidence"])[order]
-    return row | {"keypoints_px": points.ravel().tolist(), "confidence": confidence.tolist()}
-
-
-def _nothing_usable(capture: Path, what: str, reasons: list[str]) -> str:
-    examples = "; ".join(sorted(set(reasons))[:3])
+def _nothing_usable(capture: Path, what: str) -> str:
     return (
-        f"{capture}: not one of {len(reasons)} frames has a usable {what} ({examples}); look at "
-        "the pictures, choose another `mask.method`, or give hand-corrected masks in "
-        "`mask.overrides`"
+        f"{capture}: not one frame has a usable {what}; look at the pictures, choose another "
+        "`mask.method`, or give hand-corrected masks in `mask.overrides`"
     )

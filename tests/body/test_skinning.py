@@ -129,7 +129,7 @@ def test_leading_dimensions_are_free():
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 0.5])
 def test_gradients_are_right_down_to_the_zero_pose(scale):
-    model = small_model(num_vertices=4)
+    model = small_model(num_vertices=3)
     pose = random_pose(scale=scale)
     inputs = [
         getattr(pose, name).clone().requires_grad_()
@@ -140,7 +140,7 @@ def test_gradients_are_right_down_to_the_zero_pose(scale):
         posed = pose_body(model, BodyPose(*values))
         return posed.vertices, posed.joints
 
-    assert torch.autograd.gradcheck(points, inputs, atol=1e-6)
+    assert torch.autograd.gradcheck(points, inputs, atol=1e-6, fast_mode=True)
 
 
 def test_global_orient_turns_about_the_pelvis_and_transl_comes_last():

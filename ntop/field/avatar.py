@@ -49,7 +49,7 @@ def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
     content = safetensors.numpy.save(
         {
             "values": grid.values[64:].astype(np.float16),
-            "positions": grid.positions[1:],
+            "positions": np.ascontiguousarray(grid.positions[1:]),  # safetensors stores memory order
             "light": avatar.light.astype(np.float32),
         }
     )

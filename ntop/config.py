@@ -107,17 +107,29 @@ class StudioSource(SourceSection):
     """A synthetic capture with known truth."""
 
     reader: Literal["studio"]
-    num_cameras: int = Field(default=8, ge=2)
-    image_size_px: int = Field(default=512, ge=32)
-    camera_radius_m: float = Field(default=2.7, gt=1)
-    supersampling: int = Field(default=3, ge=1)
-    truth_supersampling: int = Field(default=4, ge=1)
-    seed: int = 0
-    light_to_ambient: float = Field(default=3.5, ge=0)
-    pose_noise_mm: float = Field(default=0.0, ge=0)
-    calibration_noise_px: float = Field(default=0.0, ge=0)
+    num_cameras: int = Field(default=8, ge=2, description="Side cameras on the ring.")
+    image_size_px: int = Field(default=512, ge=32, description="Side of their square images.")
+    camera_radius_m: float = Field(default=2.7, gt=1, lt=4, description="Radius of the ring.")
+    supersampling: int = Field(
+        default=3, ge=1, description="Rays per pixel and axis on outlines of the side views."
+    )
+    truth_supersampling: int = Field(
+        default=4, ge=1, description="Rays per pixel and axis on outlines of the true top views."
+    )
+    seed: int = Field(default=0, description="Of all noise below.")
+    light_to_ambient: float = Field(
+        default=3.5, ge=0, description="Strength of the distant light over that of the ambient."
+    )
+    pose_noise_mm: float = Field(
+        default=0.0, ge=0, description="Standard deviation of the given bodies' errors."
+    )
+    calibration_noise_px: float = Field(
+        default=0.0, ge=0, description="Standard deviation of the given cameras' errors."
+    )
     mask_growth_px: int = Field(default=0, description="Dilation (>0) or erosion (<0) of masks.")
-    keypoint_noise_px: float = Field(default=0.0, ge=0)
+    keypoint_noise_px: float = Field(
+        default=0.0, ge=0, description="Standard deviation of the given 2D keypoints' errors."
+    )
 
 
 Source = Annotated[QualisysSource | StudioSource, Field(discriminator="reader")]

@@ -169,9 +169,7 @@ def _record(
             )
 
 
-def _body_rows(
-    given: BodyPose, *, truth: BodyPose, sequence: Sequence, actor: Actor
-) -> list[Row]:
+def _body_rows(given: BodyPose, *, truth: BodyPose, sequence: Sequence, actor: Actor) -> list[Row]:
     """Rows of schema BODY; the error is that of the noise added."""
     joints = pose_joints(actor.model, given)
     errors_mm = 1000 * (joints - pose_joints(actor.model, truth)).norm(dim=-1).mean(-1)

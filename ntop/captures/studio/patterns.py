@@ -4,6 +4,8 @@ Every edge is a smooth step over `EDGE_M`, so that no texture holds detail finer
 this size can show. Lengths are metres, colours sRGB in 0..1.
 """
 
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -64,7 +66,7 @@ def strokes(
     """Distance to the nearest of several polylines."""
     nearest = np.full(u.shape, np.inf, dtype=u.dtype)
     for line in lines:
-        for (u0, v0), (u1, v1) in zip(line[:-1], line[1:], strict=True):
+        for (u0, v0), (u1, v1) in pairwise(line):
             du, dv = u1 - u0, v1 - v0
             along = np.clip(((u - u0) * du + (v - v0) * dv) / (du * du + dv * dv), 0, 1)
             np.minimum(nearest, np.hypot(u - u0 - along * du, v - v0 - along * dv), out=nearest)

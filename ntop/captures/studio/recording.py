@@ -59,9 +59,7 @@ def misplaced(
         turn = torch.from_numpy(generator.normal(size=3) * angle)
         shift = torch.from_numpy(generator.normal(size=3) * angle)  # a metre away: as many pixels
         rotation = matrix_from_axis_angle(turn) @ camera.rotation
-        result[view] = replace(
-            camera, rotation=rotation, center_world=camera.center_world + shift
-        )
+        result[view] = replace(camera, rotation=rotation, center_world=camera.center_world + shift)
     return result
 
 

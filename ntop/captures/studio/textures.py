@@ -5,6 +5,7 @@ rest place only, it follows the body through every pose. Garments are painted ov
 another. Colours are sRGB albedo in 0..1.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -32,11 +33,14 @@ TORSO_RADIUS_M = 0.15  # turns an angle around the body into a length on the clo
 NTOP_LETTERS = {  # strokes in units of the letter height
     "N": (0.72, [[(0, 0), (0, 1), (0.72, 0), (0.72, 1)]]),
     "T": (0.76, [[(0, 1), (0.76, 1)], [(0.38, 1), (0.38, 0)]]),
-    "o": (0.6, [[(0.3 + 0.3 * np.cos(a), 0.3 + 0.3 * np.sin(a)) for a in np.linspace(0, 2 * np.pi, 13)]]),
-    "P": (0.62, [[(0, 0), (0, 1), (0.36, 1), (0.58, 0.9), (0.62, 0.74), (0.58, 0.58), (0.36, 0.48), (0, 0.48)]]),
+    "o": (0.6, [[(0.3 + 0.3 * math.cos(a * math.pi / 6), 0.3 + 0.3 * math.sin(a * math.pi / 6))
+                 for a in range(13)]]),
+    "P": (0.62, [[(0, 0), (0, 1), (0.36, 1), (0.58, 0.9), (0.62, 0.74), (0.58, 0.58), (0.36, 0.48),
+                  (0, 0.48)]]),
 }  # fmt: skip
 
 
+COLLAR_FROM_NECK_M = np.array([0.0, 0.018, 0.032])  # centre of the neckline's ellipsoid
 CREAM, NAVY = (0.96, 0.94, 0.88), (0.06, 0.23, 0.45)
 
 
@@ -86,7 +90,7 @@ def plain_colour(points: Points, on_body: Points) -> Points:
 
 
 def cloth_coordinates(points: Points, marks: Landmarks) -> tuple[Channel, Channel]:
-    """Lengths around and along the cloth of the upper body: around the trunk, up and out the arm."""
+    """Lengths on the upper body's cloth: around the trunk, and up it and out along the arms."""
     centre_z = marks.joint("spine2")[2]
     around = TORSO_RADIUS_M * np.arctan2(points[:, 0], points[:, 2] - centre_z)
     along = points[:, 1] - np.maximum(np.abs(points[:, 0]) - 0.12, 0)
@@ -100,7 +104,7 @@ def shirt_weight(points: Points, marks: Landmarks, cut: Cut) -> Channel:
     """The shirt: above the hem, outside a round neck that is lower in front, up to the cuffs."""
     neck = marks.joint("neck")
     radii = np.array([0.088, 0.078, 0.098], dtype=points.dtype)
-    from_neck = (points - (neck + (0, 0.018, 0.032)).astype(points.dtype)) / radii
+    from_neck = (points - (neck + COLLAR_FROM_NECK_M).astype(points.dtype)) / radii
     collar = (np.sqrt((from_neck * from_neck).sum(-1)) - 1) * 0.085
     collar = np.minimum(collar, neck[1] + 0.04 - points[:, 1])
     length = np.minimum(points[:, 1] - cut.hem_y, cut.sleeve_x - np.abs(points[:, 0]))
@@ -195,14 +199,14 @@ def flannel(points: Points, marks: Landmarks) -> Points:
     period = TORSO_RADIUS_M * 2 * np.pi / 10  # ten repeats close around the trunk
     colours = plain_colour(points, (0.78, 0.13, 0.12))
     for coordinate in (around, along):
-        paint(colours, 0.72 * stripes(coordinate, period_m=period, width_m=0.036), (0.07, 0.09, 0.17))
+        paint(
+            colours, 0.72 * stripes(coordinate, period_m=period, width_m=0.036), (0.07, 0.09, 0.17)
+        )
     for coordinate in (around, along):
         line = stripes(coordinate + period / 2, period_m=period, width_m=0.021)
         paint(colours, 0.92 * line, (0.98, 0.91, 0.72))
     chest_y = marks.joint("spine3")[1] + 0.07
-    near = np.flatnonzero(
-        (np.abs(points[:, 1] - chest_y) < 0.09) & (np.abs(points[:, 0]) < 0.15)
-    )
+    near = np.flatnonzero((np.abs(points[:, 1] - chest_y) < 0.09) & (np.abs(points[:, 0]) < 0.15))
     u, v, z = points[near, 0], points[near, 1] - chest_y, points[near, 2]
     front = inside(z - marks.joint("spine2")[2], 0.02)
     printed = colours[near]
@@ -245,7 +249,9 @@ def denim(points: Points, marks: Landmarks) -> Points:
     colours *= (1 + 0.12 * ripple(points, wavelength_m=0.06, seed=21))[:, None]
     fade = inside(0.75 - np.abs(angle - np.pi / 2), 0.9) * inside(y - knee[1] + 0.12, 0.2)
     paint(colours, 0.45 * fade, (0.55, 0.68, 0.82))
-    paint(colours, inside(0.011 - np.abs(angle) * 0.07) * inside(hip[1] + 0.1 - y), (0.92, 0.90, 0.84))
+    paint(
+        colours, inside(0.011 - np.abs(angle) * 0.07) * inside(hip[1] + 0.1 - y), (0.92, 0.90, 0.84)
+    )
     pocket = box(x - hip[0], y - hip[1] + 0.02, half_size_m=(0.055, 0.06), radius_m=0.02)
     behind = inside(hip[2] - 0.03 - z, 0.02)
     paint(colours, 0.8 * behind * inside(0.006 - np.abs(pocket), 0.007), (0.85, 0.60, 0.25))

@@ -115,7 +115,7 @@ def hit_parts(actor: Actor, hits: Hits) -> UInt8[ndarray, " hit"]:
 
 
 def shade(scene: Scene, hits: Hits, directions_world: Float[ndarray, "hit 3"]) -> ndarray:
-    """sRGB colours of hit points, seen along the given unit directions."""
+    """Colours (sRGB) of hit points, seen along the given unit directions."""
     actor, light = scene.actor, scene.light
     # place and normal in one go: gathering corners is what costs
     values = np.concatenate([actor.texture_points, scene.posed.normals_world], 1, dtype=np.float32)
@@ -137,7 +137,7 @@ def srgb_to_linear(colours: Float[ndarray, "*shape"]) -> ndarray:
 
 
 def linear_to_srgb(light: Float[ndarray, "*shape"]) -> ndarray:
-    """sRGB values of linear light, clipped to 0..1 (IEC 61966-2-1)."""
+    """Linear light as sRGB values, clipped to 0..1 (IEC 61966-2-1)."""
     clipped = np.clip(light, 0, 1)
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055)
 

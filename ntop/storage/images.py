@@ -32,14 +32,10 @@ def encode_rgba(
     if rgb.shape[:2] != alpha.shape or rgb.shape[2:] != (3,):
         raise DataError(f"RGBA image: colour {rgb.shape} and alpha {alpha.shape} do not match")
     pixels = np.zeros((*alpha.shape, 4), np.uint8)
-    quantised = eight_bit(alpha)
-    rows, columns = quantised.any(1).nonzero()[0], quantised.any(0).nonzero()[0]
-    if len(rows):  # only the person's box is converted: 4 % of a usual view
-        top, bottom = max(rows[0] - DILATION_PX, 0), rows[-1] + DILATION_PX + 1
-        left, right = max(columns[0] - DILATION_PX, 0), columns[-1] + DILATION_PX + 1
-        box = np.s_[top:bottom, left:right]
-        pixels[box][..., :3] = _dilated(eight_bit(rgb[box]), quantised[box] > 0)
-        pixels[box][..., 3] = quantised[box]
+    box = _box(alpha, margin=DILATION_PX)  # only there is anything to convert: 4 % of a usual view
+    quantised = eight_bit(alpha[box])
+    pixels[box][..., :3] = _dilated(eight_bit(rgb[box]), quantised > 0)
+    pixels[box][..., 3] = quantised
     return encode_png(pixels)
 
 
@@ -55,7 +51,10 @@ def encode_depth(depth_m: Float[ndarray, "height width"]) -> bytes:
             f"depth image: values {lowest} .. {highest} m, expected 0 .. {DEPTH_LIMIT_M:.4f} m; "
             "lower the rig or crop the scene"
         )
-    return encode_png(np.rint(depth_m.astype(np.float64) / DEPTH_STEP_M).astype(np.uint16))
+    steps = np.zeros(depth_m.shape, np.uint16)
+    box = _box(depth_m, margin=0)
+    steps[box] = np.rint(depth_m[box].astype(np.float64) / DEPTH_STEP_M)
+    return encode_png(steps)
 
 
 def encode_parts(parts: UInt8[ndarray, "height width"]) -> bytes:
@@ -117,6 +116,16 @@ def read_matte(path: Path) -> Float[ndarray, "height width"]:
 def eight_bit(values: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape"]:
     """Values in [0, 1] as 0..255, rounded to nearest (half to even) and clipped."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _box(values: Float[ndarray, "height width"], *, margin: int) -> tuple[slice, slice]:
+    """The window that holds all values other than zero, and `margin` pixels more."""
+    slices = []
+    for axis, size in ((1, values.shape[0]), (0, values.shape[1])):
+        filled = np.flatnonzero(values.any(axis))
+        first, last = (filled[0], filled[-1] + 1) if len(filled) else (0, 0)
+        slices.append(slice(max(first - margin, 0), min(last + margin, size)))
+    return slices[0], slices[1]
 
 
 def _dilated(

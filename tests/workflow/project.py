@@ -21,7 +21,8 @@ class Project:
         }
         for name in ("workflow", "profiles", "config"):
             shutil.copytree(ROOT / name, folder / name)
-        shutil.copy(ROOT / "Snakefile", folder)
+        for name in ("Snakefile", "environment.yml"):
+            shutil.copy(ROOT / name, folder)
 
     def snakemake(self, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

@@ -52,10 +52,10 @@ JOINT_MARGIN_PX = 10  # mattes end a few pixels inside hands and feet
 MattePaths = dict[tuple[str, int, str], Path]
 
 
-def main(config: FitConfig, capture: Path, masks: Path, out: Path) -> None:
+def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Path) -> None:
     """Fit one actor; `out` appears by one rename, whole and checked.
 
-    `masks` holds keypoints2d.parquet, and masks.parquet unless the capture has it.
+    `keypoints` and `masks` are tables; each lies with the capture or with the mask stage.
 
     Raises:
         DataError: keypoints, cameras and frames do not fit together, or the result cannot be a
@@ -65,7 +65,7 @@ def main(config: FitConfig, capture: Path, masks: Path, out: Path) -> None:
     inputs = {
         "frames": capture / "frames.parquet",
         "cameras": capture / "cameras.parquet",
-        "keypoints2d": masks / "keypoints2d.parquet",
+        "keypoints2d": keypoints,
     }
     recordings = read_recordings(**inputs)
     model = load_body_model()
@@ -83,7 +83,7 @@ def main(config: FitConfig, capture: Path, masks: Path, out: Path) -> None:
         )
         scores |= refinement
     training = [recording.without_views(config.held_out_views) for recording in recordings]
-    mattes = _matte_paths(masks, capture, held_out_views=config.held_out_views)
+    mattes = _matte_paths(masks, held_out_views=config.held_out_views)
     fit = fit_actor(
         model,
         landmarks,
@@ -106,17 +106,13 @@ def main(config: FitConfig, capture: Path, masks: Path, out: Path) -> None:
     _publish(config, recordings, fit, scores=scores, inputs=inputs, out=out)
 
 
-def _matte_paths(masks: Path, capture: Path, *, held_out_views: tuple[str, ...]) -> MattePaths:
+def _matte_paths(table: Path, *, held_out_views: tuple[str, ...]) -> MattePaths:
     """Files of usable mattes by (action, frame, view), held-out views left out."""
-    for folder in (masks, capture):
-        table = folder / "masks.parquet"
-        if table.exists():
-            return {
-                (row["action"], row["frame"], row["view"]): folder / row["mask_path"]
-                for row in read_table(table, schema=schemas.MASK)
-                if not row["reason"] and row["view"] not in held_out_views
-            }
-    return {}
+    return {
+        (row["action"], row["frame"], row["view"]): table.parent / row["mask_path"]
+        for row in read_table(table, schema=schemas.MASK)
+        if not row["reason"] and row["view"] not in held_out_views
+    }
 
 
 def _views(recordings: list[Recording], mattes: MattePaths) -> list[View]:

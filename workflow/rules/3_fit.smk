@@ -2,7 +2,8 @@
 rule fit:
     input:
         capture=capture_folder,
-        masks=mask_folder,
+        keypoints=keypoint_folder,
+        mattes=matte_folder,
     output:
         directory("results/3_fit/{source}/{actor}"),
     log:
@@ -18,4 +19,5 @@ rule fit:
         config=stage_params("fit"),
     shell:
         "exec ntop fit --config {params.config:q} --capture {input.capture:q}"
-        " --masks {input.masks:q} --out {output:q} 2> {log:q}"
+        " --keypoints {input.keypoints:q}/keypoints2d.parquet"
+        " --masks {input.mattes:q}/masks.parquet --out {output:q} 2> {log:q}"

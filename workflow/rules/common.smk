@@ -65,17 +65,19 @@ def capture_folder(wildcards):
     return f"results/1_capture/{wildcards.source}/{wildcards.actor}"
 
 
-def mask_folder(wildcards):
-    if given(wildcards, "masks") and given(wildcards, "keypoints2d"):
-        return capture_folder(wildcards)
-    return f"results/2_mask/{wildcards.source}/{wildcards.actor}"
+def given_or_masked(what):
+    """An input function: where `what` lies, with the capture or with the mask stage."""
+
+    def folder(wildcards):
+        if given(wildcards, what):
+            return capture_folder(wildcards)
+        return f"results/2_mask/{wildcards.source}/{wildcards.actor}"
+
+    return folder
 
 
-def matte_folder(wildcards):
-    """Where the mattes lie that training reads."""
-    if given(wildcards, "masks"):
-        return capture_folder(wildcards)
-    return mask_folder(wildcards)
+matte_folder = given_or_masked("masks")
+keypoint_folder = given_or_masked("keypoints2d")
 
 
 def body_folder(wildcards):

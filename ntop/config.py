@@ -205,8 +205,18 @@ class TrainConfig(Section):
     """Section `train`."""
 
     held_out_views: tuple[str, ...] = ()
-    steps: int = Field(default=1500, ge=1)
-    rays_per_batch: int = Field(default=4096, ge=64)
+    steps: int = Field(default=800, ge=1)
+    rays_per_batch: int = Field(default=8192, ge=64)
+    finest_voxel_mm: float = Field(default=5.0, gt=0, description="Cells of the finest level.")
+    reach_m: float = Field(
+        default=0.05, gt=0, description="How far off the body clothes and hair may be."
+    )
+    camera_colour: bool = Field(
+        default=False, description="Learn a gain and bias per camera, for real captures."
+    )
+    max_person_px: int = Field(
+        default=480, ge=16, description="Pictures with a taller person are shrunk first."
+    )
     seed: int = 0
 
 

@@ -189,7 +189,7 @@ def void_values(num_slots: int) -> Float[np.ndarray, "row 4"]:
 def number_bricks(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Brick index and positions; slot 0 is the void's."""
     bricks = np.zeros(occupied.shape, np.int32)
-    positions = np.argwhere(occupied).astype(np.int32)
+    positions = np.ascontiguousarray(np.argwhere(occupied), np.int32)  # argwhere's is transposed
     bricks[tuple(positions.T)] = np.arange(1, len(positions) + 1)
     return bricks, np.concatenate([np.full((1, 3), -1, np.int32), positions])
 

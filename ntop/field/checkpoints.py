@@ -84,6 +84,8 @@ def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
     arrays = {name: getattr(state, name) for name in ARRAYS}
     arrays |= {f"grid_{name}": getattr(state.grid, name) for name in GRID_ARRAYS}
     arrays |= {"occupancy": state.occupancy.cells, "occupancy_origin": state.occupancy.origin}
+    # the format stores memory as it lies, whatever the strides
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     header = {
         "settings": settings_digest(settings),
         "voxel_m": state.grid.voxel_m,

@@ -43,7 +43,7 @@ class TrainingSettings:
     the surface's direction in the world. `camera_colour`: learn a gain and bias per camera.
     """
 
-    steps: int = 1500
+    steps: int = 800
     rays_per_batch: int = 8192
     views_per_batch: int = 32
     seed: int = 0
@@ -63,15 +63,15 @@ class TrainingSettings:
     band_px: int = 2
     shares: tuple[float, float] = (0.6, 0.25)
     entropy_weight: float = 0.02
-    density_smoothness: float = 1e-3
-    colour_smoothness: float = 1e-3
+    density_smoothness: float = 5e-5
+    colour_smoothness: float = 2e-5
     smooth_all_every: int = 25
     occupancy_every: int = 100
     occupied_raw: float = -4.0
     watch_every: int = 250
     patience: int = 3
     ray_blocks: int = 4
-    checkpoint_every: int = 200
+    checkpoint_every: int = 50
 
 
 @dataclass(frozen=True)

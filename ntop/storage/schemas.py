@@ -91,6 +91,16 @@ BODY = pa.schema(
     ]
 )
 
+# One row per training step; the watched PSNR is NaN where it was not measured.
+CURVE = pa.schema(
+    [
+        ("step", INT32),
+        ("loss", FLOAT64),
+        ("psnr_person_db", FLOAT64),
+        ("watched_psnr_db", FLOAT64),
+    ]
+)
+
 # One row per rendered view. `alpha_max` is 0 where no body is in view.
 RENDER = pa.schema(
     [

@@ -24,6 +24,6 @@ rule render:
     shell:
         "exec ntop render --config {params.config:q} --source {wildcards.source}"
         " --actor {wildcards.actor} --action {wildcards.action} --rig {wildcards.rig}"
-        " --frames {params.frames} --motion {params.motion:q} --avatar {input.avatar:q}"
+        " --frames {params.frames} --motion={params.motion:q} --avatar {input.avatar:q}"
         " --bodies {input.bodies:q}/bodies.parquet --packages {params.packages:q}"
         " --work {params.work:q} --out {output:q} 2> {log:q}"

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ntop.body.fitting.initial import initial_pose
 from ntop.body.fitting.observations import (
     ContourRays,
     LandmarkRays,
@@ -22,11 +23,11 @@ from ntop.body.fitting.observations import (
     landmark_misses_px,
 )
 from ntop.body.fitting.priors import pose_penalty
-from ntop.body.landmarks import TORSO_NAMES, BlendedLandmarks, Landmarks
+from ntop.body.landmarks import BlendedLandmarks, Landmarks
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, PosedBody, pose_body
-from ntop.conventions import NUM_BETAS, NUM_JOINTS, DataError
-from ntop.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from ntop.conventions import NUM_JOINTS
+from ntop.geometry.rotations import matrix_from_axis_angle
 from ntop.geometry.triangulation import Triangulation
 
 TRANSL_UNIT_M = 0.3  # a lever of the body: makes metres and radians steps of like size
@@ -91,8 +92,11 @@ def fit_landmarks(problem: FitProblem, rays: LandmarkRays, found: Triangulation)
     def meet_rays(_: PosedBody, points: Tensor) -> Tensor:
         return ray_cost(rays, points, settings)
 
-    start = initial_fit(problem, found)
-    near = _maximise(problem, start, meet_points, stride=COARSE_STRIDE, descents=POINT_STEPS)
+    pose = initial_pose(problem.model, problem.landmarks, problem.blend, found)
+    start = BodyFit(pose, torch.zeros_like(found.points_world[0]))
+    # each frame alone first: smoothness makes the problem stiff, and its knee hides large errors
+    alone = replace(problem, neighbours=problem.neighbours[:0])
+    near = _maximise(alone, start, meet_points, stride=COARSE_STRIDE, descents=POINT_STEPS)
     return _maximise(problem, near, meet_rays, stride=FINE_STRIDE, descents=RAY_STEPS)
 
 
@@ -123,34 +127,6 @@ def landmark_points(
     turn = posed.posed_from_rest[..., problem.landmarks.bones, :3, :3]
     points = problem.blend.points(posed.posed_from_rest, fit.pose.betas[0])
     return points + (turn @ fit.offsets_m[..., None]).squeeze(-1)
-
-
-def initial_fit(problem: FitProblem, found: Triangulation) -> BodyFit:
-    """T-poses on the triangulated torso; frames without one copy the nearest that has it.
-
-    Raises:
-        DataError: no frame has a torso.
-    """
-    frames = found.points_world.shape[0]
-    zeros = torch.zeros(frames, 3, dtype=torch.float64)
-    rest = BodyPose(zeros.new_zeros(frames, NUM_BETAS), zeros, zeros.new_zeros(frames, 69), zeros)
-    torso = [problem.landmarks.index(name) for name in TORSO_NAMES]
-    source = problem.blend.template[torso, :, :3].sum(-2)  # bones at rest are the identity
-    complete = found.valid[:, torso].all(-1)
-    rotation, translation = _rigid(source, found.points_world[:, torso])
-    known = torch.nonzero(complete).squeeze(-1)
-    if not len(known):
-        raise DataError(
-            f"body fit: shoulders and hips are triangulated in none of {frames} frames; check the "
-            "keypoints and the cameras"
-        )
-    nearest = known[(torch.arange(frames)[:, None] - known).abs().argmin(-1)]
-    rotation, translation = rotation[nearest], translation[nearest]
-    # rotation about the pelvis joint, as SMPL has it
-    pelvis = problem.model.joint_template[0]
-    transl = translation + rotation @ pelvis - pelvis
-    pose = replace(rest, global_orient=axis_angle_from_matrix(rotation), transl=transl)
-    return BodyFit(pose, torch.zeros(len(problem.landmarks.names), 3, dtype=torch.float64))
 
 
 def _maximise(
@@ -222,16 +198,3 @@ def _mirrored(offsets: Tensor, mirror: Tensor) -> Tensor:
     """Offsets averaged with the mirror image of the other side's."""
     flip = offsets.new_tensor([-1.0, 1.0, 1.0])
     return 0.5 * (offsets + flip * offsets[mirror])
-
-
-def _rigid(
-    source: Float[Tensor, "point 3"], target: Float[Tensor, "frame point 3"]
-) -> tuple[Float[Tensor, "frame 3 3"], Float[Tensor, "frame 3"]]:
-    """Rotation and translation that bring `source` nearest to each target (Kabsch 1976)."""
-    source_mean, target_mean = source.mean(0), target.mean(1)
-    covariance = (target - target_mean[:, None]).mT @ (source - source_mean)
-    left, _, right = torch.linalg.svd(covariance)
-    sign = torch.linalg.det(left @ right)
-    flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1))
-    rotation = left @ flip @ right
-    return rotation, target_mean - rotation @ source_mean

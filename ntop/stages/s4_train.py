@@ -1,0 +1,127 @@
+"""Stage train: frames, mattes, bodies -> one avatar per actor.
+
+| written below `out` | what |
+|---|---|
+| `avatar.safetensors`, `avatar.json` | the canonical field and its header (ntop.field.avatar) |
+| `curve.parquet` (schema CURVE) | loss and PSNR per step, watched frames now and then |
+| `provenance.json` | configuration, code and inputs |
+
+A stopped training continues at its last checkpoint in the work folder, with the same result.
+"""
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from ntop.body.model import load_body_model
+from ntop.captures.training_views import Tables, training_views
+from ntop.config import TrainConfig
+from ntop.field.avatar import save_avatar
+from ntop.field.training import Progress, TrainingSettings, TrainingStopped, train
+from ntop.stages import STAGES
+from ntop.storage import schemas
+from ntop.storage.atomic import atomic_folder, write_bytes
+from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
+from ntop.storage.tables import write_table
+from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, work_folder
+
+STAGE = "train"
+CHECKPOINT_NAME = "checkpoint.safetensors"
+REPORT_EVERY_S = 5.0
+
+
+def main(
+    config: TrainConfig,
+    capture: Path,
+    cameras: Path,
+    masks: Path,
+    bodies: Path,
+    work: Path,
+    out: Path,
+) -> None:
+    """Train the avatar of one actor into folder `out`.
+
+    `cameras`, `masks` and `bodies` are tables; each lies with the capture or with the stage that
+    made it. Nothing of `config.held_out_views` is read.
+
+    Raises:
+        DataError: no usable frame, tables that do not fit together, or a damaged checkpoint.
+        SystemExit: with code 143 after SIGTERM; the same command then continues.
+    """
+    torch.set_num_threads(1)  # the kernels have their own threads
+    tables = Tables(capture / "frames.parquet", cameras, masks, bodies)
+    inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
+    values = config.model_dump(mode="json")
+    settings = training_settings(config)
+    model = load_body_model()
+    recipe = {"config": values, "inputs": inputs, "code": code_sha256()}
+    with work_folder(work, recipe=recipe) as content, termination_flag() as terminated:
+        views = training_views(
+            tables,
+            model,
+            held_out_views=config.held_out_views,
+            max_person_px=config.max_person_px,
+            margin_m=config.reach_m,
+        )
+        betas = tuple(float(value) for value in views.poses.betas[0])
+        try:
+            avatar, curve = train(
+                views,
+                model,
+                betas,
+                settings=settings,
+                checkpoint_path=content / CHECKPOINT_NAME,
+                on_step=_Reporter(settings.steps),
+                stop_requested=terminated,
+            )
+        except TrainingStopped as stopped:
+            sys.stderr.write(f"train: {stopped}; the same command continues there\n")
+            raise SystemExit(EXIT_TERMINATED) from stopped
+        with atomic_folder(out) as folder:
+            save_avatar(avatar, folder, write=write_bytes)
+            rows = [{name: getattr(line, name) for name in schemas.CURVE.names} for line in curve]
+            write_table(rows, schema=schemas.CURVE, path=folder / "curve.parquet")
+            version = next(version for _, name, version in STAGES if name == STAGE)
+            record = provenance(stage=STAGE, version=version, config=values, inputs=inputs)
+            write_provenance(record, folder=folder)
+        clear_work(work)
+
+
+def training_settings(config: TrainConfig) -> TrainingSettings:
+    """The field's settings for a configuration."""
+    return TrainingSettings(
+        steps=config.steps,
+        rays_per_batch=config.rays_per_batch,
+        seed=config.seed,
+        voxels_m=(0.016, 0.008, config.finest_voxel_mm / 1000),
+        outer_m=config.reach_m,
+        camera_colour=config.camera_colour,
+    )
+
+
+class _Reporter:
+    """Progress lines on stderr: step, loss, PSNR, rate and time left."""
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._first: tuple[int, float] | None = None
+        self._last_s = 0.0
+
+    def __call__(self, line: Progress) -> None:
+        now_s = time.monotonic()
+        if self._first is None:
+            self._first = (line.step, now_s)  # the first step's time is compilation
+            return
+        if now_s - self._last_s < REPORT_EVERY_S and line.step < self._steps:
+            return
+        self._last_s = now_s
+        rate = (line.step - self._first[0]) / max(now_s - self._first[1], 1e-9)
+        left_s = (self._steps - line.step) / rate
+        sys.stderr.write(
+            f"train: step {line.step}/{self._steps}, loss {line.loss:.4f}, "
+            f"{line.psnr_person_db:.1f} dB, {rate:.1f} steps/s, {left_s:.0f} s left\n"
+        )
+        sys.stderr.flush()

@@ -65,6 +65,14 @@ class Actor(Section):
 Given = Literal["masks", "keypoints2d", "bodies"]
 
 
+class ReferenceMasks(Section):
+    """Hand-checked masks of one camera in one action, for evaluation only."""
+
+    action: str
+    view: str
+    path: str = Field(description="Polygon file (ntop.masks.polygons).")
+
+
 class SourceSection(Section):
     """What every source declares, whatever its reader."""
 
@@ -74,6 +82,7 @@ class SourceSection(Section):
     held_out_views: tuple[str, ...] = Field(
         default=(), description="Cameras of which no pixel or mask reaches training."
     )
+    reference_masks: tuple[ReferenceMasks, ...] = ()
     overrides: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="Stage section values that differ for this source."
     )
@@ -242,10 +251,13 @@ class AssembleConfig(Section):
 
 
 class EvaluateConfig(Section):
-    """Section `evaluate`, completed by the workflow with the sources' held-out cameras."""
+    """Section `evaluate`, completed by the workflow with what the sources hold out."""
 
     held_out_views: dict[str, tuple[str, ...]] = Field(
         default_factory=dict, description="Source -> cameras that training never saw."
+    )
+    reference_masks: dict[str, tuple[ReferenceMasks, ...]] = Field(
+        default_factory=dict, description="Source -> hand-checked masks of those cameras."
     )
 
 

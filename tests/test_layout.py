@@ -1,7 +1,7 @@
 """One vocabulary in five places, and set-up files that agree with each other."""
 
-import inspect
 import importlib
+import inspect
 import re
 import tomllib
 from pathlib import Path

@@ -23,7 +23,6 @@ from ntop.field.canonical import (
     occupied_cells,
 )
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
-from ntop.field.kernels.tables import DENSITY_SCALE
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
 from ntop.field.warp import PoseWarp, occupied, pose_warp
 from ntop.geometry.cameras import Camera, Equidistant
@@ -32,7 +31,7 @@ CELL_M = 0.02
 # four rays of a pixel on a rotated grid: distinct rows and columns, unbiased about the centre
 EDGE_OFFSETS_PX = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 EDGE_ALPHA = (0.02, 0.98)
-EDGE_CONTRAST = 0.08  # colour difference to a neighbour from which a pixel counts as an edge
+EDGE_CONTRAST = 0.3  # colour difference to a neighbour from which a pixel counts as an edge
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,10 @@ class RenderSettings:
         phase: Offset of all samples, in steps, for the phase-shift self-test.
     """
 
-    step_m: float = 0.0025
+    step_m: float = 0.003
     stop_transmittance: float = 1e-3
     colour_floor: float = 1e-4
-    raw_threshold: float = -4.0
+    raw_threshold: float = -3.0
     crop: bool = True
     edge_rays: int = 4
     phase: float = 0.5
@@ -125,7 +124,7 @@ def _shared(avatar: Avatar, model: BodyModel, raw_threshold: float) -> tuple:
     key = (id(avatar), id(model), raw_threshold)
     if key not in _SHARED:
         _SHARED.clear()
-        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=1)
+        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=0)
         labels = label_grid(canonical_body(model, avatar.betas))
         _SHARED[key] = (occupancy, labels, avatar, model)  # held, so that no id is used twice
     return _SHARED[key]

@@ -8,7 +8,6 @@ is nearer; there a cell keeps two *sheets*, one per part, and the renderer takes
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from ntop.body.model import BodyModel

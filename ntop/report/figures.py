@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from ntop.config import STAGE_SECTIONS
 from ntop.report.charts import human
-from ntop.stages import STAGES
 from ntop.storage.atomic import write_bytes
 
 Status = Literal["met", "missed", "none"]
@@ -140,7 +140,7 @@ CHECKS = (
         "Share of keypoints marked visible that lie on the mask.", at_least=0.95,
     ),
 )  # fmt: skip
-STAGE_NAMES = tuple(name for _, name, _ in STAGES)
+STAGE_NAMES = tuple(STAGE_SECTIONS)
 COSTS = (
     *(
         Meaning(f"seconds.{name}", f"time, {name}", "s", f"Sum over all jobs of stage {name}.")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from ntop.config import STAGE_SECTIONS
 from ntop.conventions import DataError
-from ntop.stages import STAGES
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import set_key
@@ -106,7 +106,7 @@ def stage_costs(benchmarks: Path) -> dict[str, float | None]:
     a job too short to be sampled has no memory, but counts with its time.
     """
     costs: dict[str, float | None] = {}
-    for number, name, _ in STAGES:
+    for number, name in enumerate(STAGE_SECTIONS, start=1):
         seconds, memory_mb = [], []
         for path in sorted((benchmarks / f"{number}_{name}").rglob("*.tsv")):
             with path.open(newline="") as stream:

@@ -21,7 +21,6 @@ from ntop.body.fitting.actor import ActorFit, fit_actor
 from ntop.body.fitting.contours import View, matte_border
 from ntop.body.fitting.quality import (
     body_height_m,
-    bone_length_spread_mm,
     check_upright,
     frame_reasons,
 )
@@ -94,13 +93,10 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
         settings=FitSettings(landmark_px=config.landmark_spread_px),
     )
     check_upright(fit.joints_world, f"{recordings[0].source}/{recordings[0].actor}")
-    spreads = bone_length_spread_mm(fit.found.points_world, fit.found.valid, landmarks)
     distance = (fit.points_world - fit.found.points_world).norm(dim=-1)[fit.found.valid]
     scores |= {
-        "height_m": body_height_m(model, fit.pose.betas[0].float()),
-        "joint_error_mm": 1000 * float(distance.median()),
-        "bone_length_std_mm": max(spreads.values(), default=None),
-        "bone_lengths_std_mm": spreads,
+        "fit.height_m": body_height_m(model, fit.pose.betas[0].float()),
+        "fit.joint_error_mm": 1000 * float(distance.median()),
         **_mask_scores(model, fit, training, mattes),
     }
     _publish(config, recordings, fit, scores=scores, inputs=inputs, out=out)
@@ -158,14 +154,14 @@ def _mask_scores(
                 joints = camera.project(fit.joints_world[index])[0]
                 inside.append(share_inside(joints, matte, margin_px=JOINT_MARGIN_PX))
     if not ious:
-        return {"mask_iou": None, "joints_inside": None}
+        return {"fit.mask_iou": None, "fit.joints_inside": None}
     share = sum(inside) / len(inside)
     if share < 0.5:
         raise DataError(
             f"{recordings[0].source}/{recordings[0].actor}: {share:.0%} of the joints lie in the "
             "mattes, expected 95 %; check that keypoints, mattes and cameras are of the same frames"
         )
-    return {"mask_iou": sum(ious) / len(ious), "joints_inside": share}
+    return {"fit.mask_iou": sum(ious) / len(ious), "fit.joints_inside": share}
 
 
 def _publish(

@@ -11,10 +11,11 @@ import numpy as np
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.skinning import BodyPose
 from ntop.config import EvaluateConfig
-from ntop.conventions import DataError
+from ntop.conventions import ConfigError, DataError
 from ntop.field.avatar import load_avatar
 from ntop.field.rendering import pose_avatar, render_view
 from ntop.geometry.cameras import Camera
+from ntop.masks.polygons import read_polygon_masks
 from ntop.metrics.images import Cutout
 from ntop.report.blobs import blob_max_px
 from ntop.report.capture import Recording
@@ -104,7 +105,7 @@ def report_actor(
     paint = painted_body(recording, model, views=seen).cutout
     values = fit_values(actor)
     heldout = truth = None
-    references = reference_masks(recording, held_out)
+    references = reference_masks(config, actor.source)
     found = score_heldout(recording, references, render=render, paint=paint)
     if found is not None:
         values |= heldout_values(found)
@@ -119,9 +120,24 @@ def report_actor(
     return ActorReport(values, strip, heldout, truth)
 
 
-def reference_masks(recording: Recording, held_out: set[str]) -> ReferenceMasks:
-    """Hand-checked masks of the held-out cameras' frames."""
-    return {}
+def reference_masks(config: EvaluateConfig, source: str) -> ReferenceMasks:
+    """Hand-checked masks of the source's held-out cameras, by (action, frame, view).
+
+    Raises:
+        ConfigError: masks of a camera that training saw.
+        DataError: a polygon file cannot be read.
+    """
+    held_out = config.held_out_views.get(source, ())
+    masks: ReferenceMasks = {}
+    for item in config.reference_masks.get(source, ()):
+        if item.view not in held_out:
+            raise ConfigError(
+                f"reference masks {item.path} are of camera {item.view}, which is not held out of "
+                f"{source} (held out: {list(held_out)}): scores on it would flatter"
+            )
+        for frame, mask in read_polygon_masks(Path(item.path)).items():
+            masks[item.action, frame, item.view] = mask
+    return masks
 
 
 def avatar_renderer(actor: ActorFolders, model: BodyModel) -> Renderer:
@@ -144,7 +160,7 @@ def fit_values(actor: ActorFolders) -> Values:
         scores = json.loads(path.read_text())
     except ValueError as error:
         raise DataError(f"{path} is not JSON: {error}; rerun the fit stage") from error
-    return {key: value for key, value in scores.items() if "." in key}
+    return scores
 
 
 def dataset_values(dataset: Dataset) -> Values:

@@ -16,6 +16,7 @@ rule evaluate:
         mattes=actor_folders(matte_folder),
         bodies=actor_folders(body_folder),
         avatars=[f"results/4_train/{actor.source}/{actor.actor}" for actor in ACTORS],
+        references=reference_mask_files,
     output:
         directory("results/8_evaluate/{dataset}"),
     log:
@@ -31,7 +32,7 @@ rule evaluate:
         config=evaluate_params,
         benchmarks="results/benchmarks",
     shell:
-        "exec ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
+        "NUMBA_NUM_THREADS={threads} exec ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
         " --captures {input.captures:q} --mattes {input.mattes:q} --bodies {input.bodies:q}"
         " --avatars {input.avatars:q} --benchmarks {params.benchmarks:q}"
         " --out {output:q} 2> {log:q}"

@@ -181,6 +181,30 @@ def actor_folders(folder_of):
     return folders
 
 
+
+def evaluate_params(wildcards):
+    names = sorted({actor.source for actor in ACTORS})
+    sections = {name: CONFIG.sources[name] for name in names}
+    extra = {
+        "held_out_views": {
+            name: list(section.held_out_views)
+            for name, section in sections.items()
+            if section.held_out_views
+        },
+        "reference_masks": {
+            name: [item.model_dump(mode="json") for item in section.reference_masks]
+            for name, section in sections.items()
+            if section.reference_masks
+        },
+    }
+    return params_json("evaluate", None, extra)
+
+
+def reference_mask_files(wildcards):
+    sections = {actor.source: CONFIG.sources[actor.source] for actor in ACTORS}
+    return [item.path for section in sections.values() for item in section.reference_masks]
+
+
 SHARDS = [
     f"{row.source}/{row.actor}/{row.action}/{rig}/{first:06d}"
     for row in SEQUENCES

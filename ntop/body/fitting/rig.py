@@ -4,7 +4,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ntop.body.fitting.recordings import Recording
+from ntop.body.fitting.observations import triangulated_landmarks
+from ntop.body.fitting.quality import bone_length_spread_mm
+from ntop.body.fitting.recordings import Recording, landmark_rays
 from ntop.body.landmarks import LIMB_NAMES, Landmarks
 from ntop.conventions import DataError
 from ntop.geometry.calibration import RefinementSettings, agreement_px, refine_rig
@@ -14,6 +16,7 @@ from ntop.geometry.refinement import Observations, observe
 # Refinement is scored on every fourth instant, counted from the third; cameras use the others.
 FOLD, SCORED = 4, 2
 SAME_PLACE_M = 1e-6
+SPREAD_TOLERANCE_PX = 25.0  # a camera that misses a limb point by more does not count
 
 
 def refine_recordings(
@@ -65,19 +68,38 @@ def refine_recordings(
     )
     placed = dict(zip(views, refined, strict=True))
     moved = [recording.with_extrinsics(placed) for recording in recordings]
-    return moved, _scores(recordings, moved, limbs)
+    spreads = _bone_length_spreads_mm(moved, landmarks, min_confidence=min_confidence)
+    scores = _scores(recordings, moved, limbs)
+    scores |= {f"refine_cameras.bone_length_std_mm.{bone}": s for bone, s in spreads.items()}
+    if spreads:
+        scores["refine_cameras.bone_length_std_mm"] = max(spreads.values())
+    return moved, scores
+
+
+def _bone_length_spreads_mm(
+    recordings: list[Recording], landmarks: Landmarks, *, min_confidence: float
+) -> dict[str, float]:
+    """How constant limb bones are on the scored instants: the worst action's spread per bone."""
+    worst: dict[str, float] = {}
+    for recording in recordings:
+        rays = landmark_rays([recording], landmarks, min_confidence=min_confidence)
+        found = triangulated_landmarks(rays, tolerance_px=SPREAD_TOLERANCE_PX)
+        chosen = _scored(recording)
+        spreads = bone_length_spread_mm(found.points_world[chosen], found.valid[chosen], landmarks)
+        worst |= {bone: max(spread, worst.get(bone, 0.0)) for bone, spread in spreads.items()}
+    return worst
 
 
 def _scores(before: list[Recording], after: list[Recording], limbs: list[int]) -> dict[str, float]:
     old = {r.action: _agreement(r, limbs) for r in before}
     new = {r.action: _agreement(r, limbs) for r in after}
     scores = {
-        "before_px": _median(torch.cat(list(old.values()))),
-        "heldout_px": _median(torch.cat(list(new.values()))),
+        "refine_cameras.before_px": _median(torch.cat(list(old.values()))),
+        "refine_cameras.heldout_px": _median(torch.cat(list(new.values()))),
     }
     for action in old:
-        scores[f"before_px.{action}"] = _median(old[action])
-        scores[f"heldout_px.{action}"] = _median(new[action])
+        scores[f"refine_cameras.before_px.{action}"] = _median(old[action])
+        scores[f"refine_cameras.heldout_px.{action}"] = _median(new[action])
     return {name: value for name, value in scores.items() if value is not None}
 
 

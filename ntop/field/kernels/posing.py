@@ -203,7 +203,7 @@ def node_records(
 
 @device
 def apply_map(m, x, y, z, out):
-    """out = affine map (3, 4) of a point."""
+    """Out = affine map (3, 4) of a point."""
     for i in range(3):
         out[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
 

@@ -1,0 +1,1 @@
+"""Scores: images, 2D keypoints, 3D joints, dataset statistics; pure numpy, one definition each."""

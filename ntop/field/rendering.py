@@ -124,7 +124,7 @@ def _shared(avatar: Avatar, model: BodyModel, raw_threshold: float) -> tuple:
     key = (id(avatar), id(model), raw_threshold)
     if key not in _SHARED:
         _SHARED.clear()
-        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=0)
+        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=1)
         labels = label_grid(canonical_body(model, avatar.betas))
         _SHARED[key] = (occupancy, labels, avatar, model)  # held, so that no id is used twice
     return _SHARED[key]

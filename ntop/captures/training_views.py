@@ -89,9 +89,7 @@ def training_views(
     return _crops(usable, tables, model, cameras, bodies, masks, (max_person_px, margin_m))
 
 
-def _reason_to_skip(
-    row: Row, bodies: dict, masks: dict, held_out_views: tuple[str, ...]
-) -> str:
+def _reason_to_skip(row: Row, bodies: dict, masks: dict, held_out_views: tuple[str, ...]) -> str:
     mask = masks.get((row["action"], row["frame"], row["view"]))
     if row["view"] in held_out_views:
         return "view is held out"
@@ -149,8 +147,11 @@ def _crops(
         boxes.append(box)
         view_camera.append(keys.index(key))
         view_pose.append(pose)
-    numbers = {frame: n for a in {f[0] for f in frames} for n, frame in enumerate(
-        f for f in frames if f[0] == a)}
+    numbers = {
+        frame: n
+        for a in {f[0] for f in frames}
+        for n, frame in enumerate(f for f in frames if f[0] == a)
+    }
     watched = [numbers[frames[p]] % WATCH_EVERY == WATCH_EVERY // 2 for p in view_pose]
     return TrainingViews(
         cameras=tuple(scaled[key] for key in keys),

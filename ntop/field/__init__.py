@@ -1,1 +1,1 @@
-"""Avatars: a canonical voxel radiance field, warped to each pose, marched along any camera's rays."""
+"""Avatars: a canonical voxel radiance field, warped to each pose, marched along camera rays."""

@@ -49,7 +49,8 @@ def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
     content = safetensors.numpy.save(
         {
             "values": grid.values[64:].astype(np.float16),
-            "positions": np.ascontiguousarray(grid.positions[1:]),  # safetensors stores memory order
+            # safetensors stores memory order
+            "positions": np.ascontiguousarray(grid.positions[1:]),
             "light": avatar.light.astype(np.float32),
         }
     )

@@ -174,7 +174,8 @@ def render_view(
     v, u = np.nonzero(mask[inner])
     centres = np.stack([u + left, v + top], 1) + PIXEL_CENTRE
     first = _trace_pixels(posed, camera, centres, settings=settings)
-    straight, box_alpha = np.zeros((rows, columns, 3), np.float32), np.zeros((rows, columns), np.float32)
+    straight = np.zeros((rows, columns, 3), np.float32)
+    box_alpha = np.zeros((rows, columns), np.float32)
     straight[v, u], box_alpha[v, u] = first.rgb, first.alpha
     depth[v + top, u + left], parts[v + top, u + left] = first.depth_m, first.parts
     evaluations = first.evaluations
@@ -217,9 +218,7 @@ def body_pixels(posed: PosedAvatar, camera: Camera) -> Bool[np.ndarray, "height 
     if len(full) and float(distances.min()) < 2 * radius:
         marked[:] = 1  # the camera is inside the body: every pixel may see it
     else:
-        mark_tiles(
-            pixels.numpy(), distances.numpy(), seen.numpy(), radius, px_per_rad, marked
-        )
+        mark_tiles(pixels.numpy(), distances.numpy(), seen.numpy(), radius, px_per_rad, marked)
     return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[:height, :width].astype(bool)
 
 

@@ -98,7 +98,7 @@ def train(
     """Train to the end, or until the watched views stop improving.
 
     Continues from `checkpoint_path` if it exists. When `stop_requested` becomes true the state is
-    saved and `TrainingStopped` is raised.
+    saved and `TrainingStoppedError` is raised.
     """
     body = canonical_body(model, betas)
     warps = [
@@ -111,7 +111,7 @@ def train(
     origins = np.stack([warp.origin_world for warp in warps])
     source = _ray_source(views, ~views.watched, origins, settings)
     watched = _watched_rays(views, origins, settings)
-    state = None if checkpoint_path is None else load_checkpoint(checkpoint_path, settings, Progress)
+    state = checkpoint_path and load_checkpoint(checkpoint_path, settings, Progress)
     state = state or initial_state(body, len(views.cameras), settings)
     trainer = _Trainer(state, warps, settings)
     while trainer.state.step < settings.steps and not _stalled(trainer.state.curve, settings):
@@ -123,13 +123,13 @@ def train(
         if checkpoint_path is not None and saving:
             save_checkpoint(state, checkpoint_path, settings)
         if stop_requested():
-            raise TrainingStopped(f"stopped after step {state.step} of {settings.steps}")
+            raise TrainingStoppedError(f"stopped after step {state.step} of {settings.steps}")
     state = trainer.state
     avatar = Avatar(state.grid, state.light.astype(np.float32), betas, settings.outer_m, state.step)
     return avatar, state.curve
 
 
-class TrainingStopped(Exception):
+class TrainingStoppedError(Exception):
     """Training was asked to stop and has saved its state."""
 
 
@@ -239,7 +239,9 @@ class _Trainer:
         self._touched[:, 0] = 0
         rate = _decayed(settings.light_rate, share)
         if settings.light:
-            _small_adam(state.light, self._light_gradients.sum(0), state.light_moments, state.step, rate)
+            _small_adam(
+                state.light, self._light_gradients.sum(0), state.light_moments, state.step, rate
+            )
         if settings.camera_colour:
             gradient = self._gain_gradients.sum(0) + 0.01 * settings.rays_per_batch * state.gain
             _small_adam(state.gain, gradient, state.gain_moments, state.step, 0.3 * rate)

@@ -101,9 +101,7 @@ def occupied(warp: PoseWarp, occupancy: Occupancy) -> PoseWarp:
     """The same warp that skips what the canonical occupancy rules out."""
     tables = warp.tables
     found = np.empty_like(tables.occupancy)
-    octant_occupancy(
-        tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, found
-    )
+    octant_occupancy(tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, found)
     return replace(warp, tables=tables._replace(occupancy=found, blocks=_blocks(tables, found)))
 
 
@@ -118,10 +116,16 @@ def joined(warps: list[PoseWarp]) -> WarpTables:
         block_offset=np.cumsum([0] + [len(t.blocks) for t in tables])[:-1],
         inverse_cell=tables[0].inverse_cell,
         cells=np.concatenate(
-            [np.where(t.cells >= 0, t.cells + s, -1) for t, s in zip(tables, cell_start[:-1], strict=True)]
+            [
+                np.where(t.cells >= 0, t.cells + s, -1)
+                for t, s in zip(tables, cell_start[:-1], strict=True)
+            ]
         ).astype(np.int32),
         sheets=np.concatenate(
-            [np.where(t.sheets >= 0, t.sheets + s, -1) for t, s in zip(tables, node_start[:-1], strict=True)]
+            [
+                np.where(t.sheets >= 0, t.sheets + s, -1)
+                for t, s in zip(tables, node_start[:-1], strict=True)
+            ]
         ).astype(np.int32),
         nodes=np.concatenate([t.nodes for t in tables]),
         occupancy=np.concatenate([t.occupancy for t in tables]),
@@ -180,9 +184,7 @@ def _vertex_maps(
     return maps, normals
 
 
-def _cells_near(
-    squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: float
-) -> np.ndarray:
+def _cells_near(squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: float) -> np.ndarray:
     """Cell numbers: cells with a corner within reach of the surface, -1 for the others."""
     limit = (reach_m + 0.9 * cell_m) ** 2  # a point of the cell is this close to some corner
     near = squared <= limit

@@ -38,7 +38,7 @@ class Pinhole:
     def project(
         self, points_camera: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-        """Pixels of camera-frame points; seen = in front of the camera (the image is not clipped)."""
+        """Pixels of camera-frame points; seen = in front of the camera, inside the image or not."""
         z = points_camera[..., 2]
         seen = z > 1e-9
         safe_z = torch.where(seen, z, torch.ones_like(z))

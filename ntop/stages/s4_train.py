@@ -20,7 +20,7 @@ from ntop.body.model import load_body_model
 from ntop.captures.training_views import Tables, training_views
 from ntop.config import TrainConfig
 from ntop.field.avatar import save_avatar
-from ntop.field.training import Progress, TrainingSettings, TrainingStopped, train
+from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
 from ntop.stages import STAGES
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
@@ -77,7 +77,7 @@ def main(
                 on_step=_Reporter(settings.steps),
                 stop_requested=terminated,
             )
-        except TrainingStopped as stopped:
+        except TrainingStoppedError as stopped:
             sys.stderr.write(f"train: {stopped}; the same command continues there\n")
             raise SystemExit(EXIT_TERMINATED) from stopped
         with atomic_folder(out) as folder:

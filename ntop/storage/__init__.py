@@ -1,1 +1,1 @@
-"""Files: Parquet tables with explicit schemas, images, COCO and SMPL JSON; all written atomically."""
+"""Files: Parquet tables with explicit schemas, images, COCO and SMPL JSON; written atomically."""

@@ -12,7 +12,7 @@ from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
 from ntop.field.avatar import ARRAYS_NAME, load_avatar, save_avatar
 from ntop.field.rendering import RenderSettings, pose_avatar, render_view
-from ntop.field.training import TrainingSettings, TrainingStopped, train
+from ntop.field.training import TrainingSettings, TrainingStoppedError, train
 from ntop.field.views import TrainingViews
 from ntop.geometry.cameras import Camera, Pinhole
 
@@ -26,7 +26,9 @@ def standing_pose():
     zeros = torch.zeros(1, 3, dtype=torch.float64)
     upright = torch.tensor([[math.pi / 2, 0, 0]], dtype=torch.float64)  # y up -> z up
     transl = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    return BodyPose(torch.zeros(1, 10, dtype=torch.float64), upright, zeros.new_zeros(1, 69), transl)
+    return BodyPose(
+        torch.zeros(1, 10, dtype=torch.float64), upright, zeros.new_zeros(1, 69), transl
+    )
 
 
 def first(poses):
@@ -104,7 +106,7 @@ def test_a_stopped_training_ends_with_the_same_bytes(views, model, tmp_path):
     whole, curve = trained(views, model)
     path = tmp_path / "checkpoint.safetensors"
     stops = chain([False] * 9, repeat(True))
-    with pytest.raises(TrainingStopped):
+    with pytest.raises(TrainingStoppedError):
         trained(views, model, checkpoint_path=path, stop_requested=lambda: next(stops))
     again, curve_again = trained(views, model, checkpoint_path=path)
     assert again.grid.values.tobytes() == whole.grid.values.tobytes()

@@ -111,9 +111,8 @@ def test_a_duplicate_of_a_running_job_is_refused(shop):
 
 
 def test_sigterm_ends_at_a_set_border_with_143_and_the_next_run_goes_on(shop, shards):
-    program = "import sys\nfrom pathlib import Path\nfrom ntop.cli import main\nsys.exit(main(sys.argv[1:]))"
     command = [
-        sys.executable, "-c", program, "render", "--config", shop.config.model_dump_json(),
+        sys.executable, "-m", "ntop.cli", "render", "--config", shop.config.model_dump_json(),
         "--source", SOURCE, "--actor", ACTOR, "--action", ACTION, "--rig", RIG,
         "--frames", "0", "1", "--motion", "", "--avatar", str(shop.folder / "avatar"),
         "--bodies", str(shop.folder / f"{ACTOR}.parquet"), "--packages", str(shop.folder),
@@ -147,7 +146,7 @@ def test_novel_motion_stands_on_the_floor_below_the_rig(shop):
     assert centre["center_world_m"] == pytest.approx([*joints[0, :2], joints[0, 2] + 1.2], abs=1e-9)
 
 
-def test_unknown_rig_frame_actor_and_motion_say_what_there_is(shop, tmp_path):
+def test_unknown_rig_frame_actor_and_motion_say_what_there_is(shop):
     with pytest.raises(DataError, match="frames 0 to 3"):
         shop.render("a", frames=(0, 77))
     with pytest.raises(ConfigError, match="authored"):
@@ -159,7 +158,7 @@ def test_unknown_rig_frame_actor_and_motion_say_what_there_is(shop, tmp_path):
         s5_render.rig_of(other, RIG)
 
 
-def test_an_unwritable_output_folder_is_a_clear_error(shop, tmp_path):
+def test_an_unwritable_output_folder_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match="check"):
         s5_render.publish([], [], content=tmp_path, out=tmp_path / "file" / "shard")

@@ -64,9 +64,7 @@ def train_rays(
         kept = np.empty((MAX_SAMPLES, 12), np.float64)
         # columns: d tau / d raw, tau, weight, T after, albedo (3), normal (3), -, -
         for r in range(block * count // blocks, (block + 1) * count // blocks):
-            start_ray(
-                warp, poses[r], origins[r], directions[r], step, offsets[r], ray, state
-            )
+            start_ray(warp, poses[r], origins[r], directions[r], step, offsets[r], ray, state)
             samples = 0
             thickness, transmittance = 0.0, 1.0
             red = green = blue = 0.0

@@ -1,4 +1,4 @@
-"""Loops over the canonical grid: distance to the rest surface, resampling, what may hold density."""
+"""Loops over the canonical grid: distance to the rest surface, resampling, where density may be."""
 
 import numba
 import numpy as np

@@ -11,7 +11,7 @@ NEIGHBOURS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1
 
 @device
 def neighbour_row(bricks, position, i, j, k):
-    """Row of node (i, j, k) counted from a brick's first node, -1 beyond the grid or in the void."""
+    """Row of node (i, j, k) from a brick's first node on, -1 beyond the grid or in the void."""
     x, y, z = 4 * position[0] + i, 4 * position[1] + j, 4 * position[2] + k
     if x < 0 or y < 0 or z < 0:
         return -1

@@ -113,18 +113,22 @@ def render_rays(
                         median_cell, median_sheet = cell, sheet
                         mx, my, mz = state[1], state[2], state[3]
                     if weight >= colour_floor:
-                        nx, ny, nz = surface_normal(
-                            warp, cell, sheet, state[1], state[2], state[3]
-                        )
+                        nx, ny, nz = surface_normal(warp, cell, sheet, state[1], state[2], state[3])
                         corner_rows, corner_weights = rows[sheet], weights[sheet]
-                        red += weight * shade(light, 0, nx, ny, nz) * sigmoid(
-                            interpolate(grid, 1, corner_rows, corner_weights)
+                        red += (
+                            weight
+                            * shade(light, 0, nx, ny, nz)
+                            * sigmoid(interpolate(grid, 1, corner_rows, corner_weights))
                         )
-                        green += weight * shade(light, 1, nx, ny, nz) * sigmoid(
-                            interpolate(grid, 2, corner_rows, corner_weights)
+                        green += (
+                            weight
+                            * shade(light, 1, nx, ny, nz)
+                            * sigmoid(interpolate(grid, 2, corner_rows, corner_weights))
                         )
-                        blue += weight * shade(light, 2, nx, ny, nz) * sigmoid(
-                            interpolate(grid, 3, corner_rows, corner_weights)
+                        blue += (
+                            weight
+                            * shade(light, 2, nx, ny, nz)
+                            * sigmoid(interpolate(grid, 3, corner_rows, corner_weights))
                         )
                     thickness += tau
                     transmittance = math.exp(-thickness)

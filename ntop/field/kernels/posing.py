@@ -254,7 +254,11 @@ def cell_sheets(
                             gap += (records[record, a] - predicted[a]) ** 2
                         if gap < 4 * agree * agree:
                             continue
-                    start, start_candidate, start_corner = distance[candidate, node], candidate, corner
+                    start, start_candidate, start_corner = (
+                        distance[candidate, node],
+                        candidate,
+                        corner,
+                    )
             if start_corner < 0:
                 sheets[number, sheet, 0] = -1
                 continue

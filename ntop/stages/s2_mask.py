@@ -39,6 +39,7 @@ from ntop.masks.segmentation import (
 )
 from ntop.masks.tracking import Networks, Sighting, follow_person
 from ntop.storage import schemas
+from ntop.storage.atomic import atomic_folder
 from ntop.storage.frames import iterate_frames
 from ntop.storage.images import read_matte, write_matte
 from ntop.storage.tables import Row, read_table, write_table
@@ -78,13 +79,23 @@ def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
         config: method, networks, folder of hand-corrected masks, what the source provides.
         capture: folder of the capture stage: `frames.parquet`, pictures, optionally `plates/`.
         packages: folder of fetched packages with the networks.
-        out: folder to write.
+        out: folder to write; it appears by one rename.
 
     Raises:
         DataError: unreadable frames or networks, a hand-corrected mask of another size than its
             frame, or not one frame of the actor with a usable mask, or with keypoints.
     """
-    job = Job(config, capture, packages, out)
+    with atomic_folder(out) as folder:
+        segment_capture(Job(config, capture, packages, folder))
+
+
+def segment_capture(job: Job) -> None:
+    """Process all views of a capture and write the tables.
+
+    Raises:
+        DataError: see `main`.
+    """
+    capture, out = job.capture, job.out
     table = read_table(capture / "frames.parquet", schema=schemas.FRAME)
     rows = sorted(table, key=lambda row: (row["action"], row["view"], row["frame"]))
     views = [list(g) for _, g in groupby(rows, key=lambda row: (row["action"], row["view"]))]

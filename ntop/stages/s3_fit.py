@@ -25,7 +25,7 @@ from ntop.body.fitting.quality import (
     frame_reasons,
 )
 from ntop.body.fitting.recordings import Recording, landmark_rays
-from ntop.body.fitting.rig import refine_recordings
+from ntop.body.fitting.rig import place_on_bodies, refine_recordings
 from ntop.body.fitting.silhouettes import share_inside, silhouette_iou
 from ntop.body.fitting.solver import FitSettings
 from ntop.body.landmarks import landmarks_on
@@ -70,17 +70,15 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
     model = load_body_model()
     landmarks = landmarks_on(model, recordings[0].skeleton)
     scores: dict[str, Any] = {}
+    refinement = RefinementSettings(config.prior_weight, config.loss_scale_px, config.outlier_px)
     if config.refine_cameras:
-        recordings, refinement = refine_recordings(
+        recordings, scores = refine_recordings(
             recordings,
             landmarks,
             held_out_views=config.held_out_views,
             min_confidence=config.min_confidence,
-            settings=RefinementSettings(
-                config.prior_weight, config.loss_scale_px, config.outlier_px
-            ),
+            settings=refinement,
         )
-        scores |= refinement
     training = [recording.without_views(config.held_out_views) for recording in recordings]
     mattes = _matte_paths(masks, held_out_views=config.held_out_views)
     fit = fit_actor(
@@ -92,6 +90,15 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
         outlier_px=config.outlier_px,
         settings=FitSettings(landmark_px=config.landmark_spread_px),
     )
+    if config.refine_cameras:
+        recordings = place_on_bodies(
+            recordings,
+            fit.points_world.detach(),
+            landmarks,
+            views=config.held_out_views,
+            min_confidence=config.min_confidence,
+            settings=refinement,
+        )
     check_upright(fit.joints_world, f"{recordings[0].source}/{recordings[0].actor}")
     distance = (fit.points_world - fit.found.points_world).norm(dim=-1)[fit.found.valid]
     scores |= {

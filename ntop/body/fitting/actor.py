@@ -22,7 +22,7 @@ from ntop.body.skinning import BodyPose, pose_body
 from ntop.geometry.triangulation import Triangulation
 
 CANDIDATE_CELL_M = 0.03
-CONTOUR_REACH_PX = (60.0, 40.0, 25.0)  # per round; the last decides what counts as matched
+CONTOUR_REACH_PX = (60.0, 40.0, 25.0, 15.0)  # per round; the last decides what counts as matched
 MAX_SMOOTH_STEP = 5  # frames further apart say nothing about each other
 
 

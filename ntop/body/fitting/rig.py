@@ -1,7 +1,7 @@
 """The cameras of an actor's recordings refined on his limbs, and what that gains."""
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ntop.body.fitting.observations import triangulated_landmarks
@@ -11,7 +11,7 @@ from ntop.body.landmarks import LIMB_NAMES, Landmarks
 from ntop.conventions import DataError
 from ntop.geometry.calibration import RefinementSettings, agreement_px, refine_rig
 from ntop.geometry.cameras import Camera
-from ntop.geometry.refinement import Observations, observe
+from ntop.geometry.refinement import Observations, observe, resect
 
 # Refinement is scored on every fourth instant, counted from the third; cameras use the others.
 FOLD, SCORED = 4, 2
@@ -74,6 +74,56 @@ def refine_recordings(
     if spreads:
         scores["refine_cameras.bone_length_std_mm"] = max(spreads.values())
     return moved, scores
+
+
+def place_on_bodies(
+    recordings: list[Recording],
+    points_world: Float[Tensor, "frame landmark 3"],
+    landmarks: Landmarks,
+    *,
+    views: tuple[str, ...],
+    min_confidence: float,
+    settings: RefinementSettings,
+) -> list[Recording]:
+    """Recordings whose `views` are placed so that they see the fitted bodies' landmarks.
+
+    Triangulated points carry each camera's own bias of the detector; a body that also fits the
+    silhouettes of the other cameras does not. Only keypoints of even frames are used.
+
+    Raises:
+        DataError: fewer than six points are observed.
+    """
+    chosen = torch.nonzero(landmarks.defined).squeeze(-1)
+    placed = {}
+    for view in views:
+        index, start = recordings[0].views.index(view), 0
+        observations, points = [], []
+        for recording in recordings:
+            count = len(recording.frames)
+            even = torch.tensor(recording.frames) % 2 == 0
+            certain = recording.confidence[:, index, chosen] >= min_confidence
+            observations.append(
+                observe(
+                    [recording.cameras[index]],
+                    recording.pixels[:, index, chosen].reshape(-1, 1, 2),
+                    (certain & even[:, None]).double().reshape(-1, 1),
+                )
+            )
+            points.append(points_world[start : start + count, chosen].reshape(-1, 3))
+            start += count
+        placed[view] = resect(
+            recordings[0].cameras[index],
+            Observations.joined(observations),
+            torch.cat(points),
+            prior_weight=settings.prior_weight,
+            loss_scale_px=settings.loss_scale_px,
+        )
+    return [
+        recording.with_extrinsics(
+            dict(zip(recording.views, recording.cameras, strict=True)) | placed
+        )
+        for recording in recordings
+    ]
 
 
 def _bone_length_spreads_mm(

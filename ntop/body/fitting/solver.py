@@ -34,7 +34,7 @@ TRANSL_UNIT_M = 0.3  # a lever of the body: makes metres and radians steps of li
 # Adam: how far an unknown moves per step (radians, 0.3 m, one beta) at first, and how many steps
 COARSE_STRIDE, POINT_STEPS = 0.06, 250
 FINE_STRIDE, RAY_STEPS = 0.02, 300
-CONTOUR_STRIDE, CONTOUR_STEPS = 0.01, 60
+CONTOUR_STRIDE, CONTOUR_STEPS = 0.01, 120
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class FitSettings:
     landmark_px: float = 6.0
     landmark_m: float = 0.03
     contour_px: float = 4.0
-    contour_weight: float = 0.1  # neighbouring border points are not independent
+    contour_weight: float = 0.5  # neighbouring border points are not independent
     betas: float = 1.5
     acceleration_m: float = 0.003  # second difference of a joint from frame to frame
     turn_rad: float = 0.03  # second difference of a joint's rotation matrix entries

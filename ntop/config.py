@@ -220,6 +220,16 @@ class TrainConfig(Section):
     reach_m: float = Field(
         default=0.05, gt=0, description="How far off the body clothes and hair may be."
     )
+    density_smoothness: float = Field(
+        default=5e-5,
+        ge=0,
+        description="Pull between neighbouring cells' densities; raise it "
+        "where masks and poses are measured, not given.",
+    )
+    colour_smoothness: float = Field(default=2e-5, ge=0, description="The same for colours.")
+    entropy_weight: float = Field(
+        default=0.02, ge=0, description="Pushes rays towards opaque or empty."
+    )
     camera_colour: bool = Field(
         default=False, description="Learn a gain and bias per camera, for real captures."
     )

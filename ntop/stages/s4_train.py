@@ -98,6 +98,9 @@ def training_settings(config: TrainConfig) -> TrainingSettings:
         seed=config.seed,
         voxels_m=(0.016, 0.008, config.finest_voxel_mm / 1000),
         outer_m=config.reach_m,
+        density_smoothness=config.density_smoothness,
+        colour_smoothness=config.colour_smoothness,
+        entropy_weight=config.entropy_weight,
         camera_colour=config.camera_colour,
     )
 

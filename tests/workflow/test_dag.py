@@ -80,6 +80,10 @@ class TestAfterTheCampaign:
         ("change", "expected"),
         [
             ("train={'steps': 151}", {"train", "render", "annotate", "assemble", "evaluate"}),
+            (
+                "sources={'raw': {'overrides': {'train': {'reach_m': 0.06}}}}",
+                {"train", "render", "annotate", "assemble", "evaluate"},
+            ),
             ("render={'seed': 5}", {"render", "annotate", "assemble", "evaluate"}),
         ],
     )

@@ -24,6 +24,8 @@ except ConfigError as error:
 
 VERSIONS = {name: version for _, name, version in STAGES}
 PACKAGES = "data/packages"
+# what a source says to later stages must not rerun its capture
+NOT_FOR_CAPTURE = {"overrides", "reference_masks", "held_out_views"}
 KEY = "{source}/{actor}"
 
 
@@ -134,7 +136,9 @@ def capture_params(wildcards):
     rows = sequences_of(wildcards, "train")
     rows += [row for row in sequences_of(wildcards, "render") if row.truth]
     extra = {
-        "source_section": section.model_dump(mode="json", exclude_defaults=True)
+        "source_section": section.model_dump(
+            mode="json", exclude_defaults=True, exclude=NOT_FOR_CAPTURE
+        )
         | {"reader": section.reader},
         "sequences": [
             row.model_dump(mode="json", exclude_defaults=True) for row in rows
@@ -181,7 +185,6 @@ def actor_folders(folder_of):
     return folders
 
 
-
 def evaluate_params(wildcards):
     names = sorted({actor.source for actor in ACTORS})
     sections = {name: CONFIG.sources[name] for name in names}
@@ -202,7 +205,9 @@ def evaluate_params(wildcards):
 
 def reference_mask_files(wildcards):
     sections = {actor.source: CONFIG.sources[actor.source] for actor in ACTORS}
-    return [item.path for section in sections.values() for item in section.reference_masks]
+    return [
+        item.path for section in sections.values() for item in section.reference_masks
+    ]
 
 
 SHARDS = [

@@ -110,7 +110,7 @@ def test_a_plate_of_another_size_is_named(capture, tmp_path):
     shutil.copytree(capture, broken)
     plate = next((broken / "plates").glob("*.png"))
     cv2.imwrite(str(plate), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(DataError, match=f"{plate.name}.*expected 160x160"):
+    with pytest.raises(DataError, match=rf"{plate.stem}.*expected 160x160"):
         s2_mask.main(BACKGROUND, broken, packages=broken, out=tmp_path / "out")
 
 

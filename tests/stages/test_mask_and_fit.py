@@ -135,7 +135,7 @@ def test_nan_keypoints_are_refused_with_their_place(capture, tmp_path):
     path = changed(
         capture, "keypoints2d.parquet", schemas.KEYPOINTS2D, tmp_path / "k.parquet", poison
     )
-    with pytest.raises(DataError, match="not finite|NaN|nan"):
+    with pytest.raises(DataError, match=r"not finite|NaN|nan"):
         fit(capture, tmp_path / "fit", keypoints=path)
     assert not (tmp_path / "fit").exists()
 

@@ -108,3 +108,8 @@ class TestAfterTheCampaign:
                  for p in (campaign.folder / "results/benchmarks").rglob("*.tsv")}  # fmt: skip
         assert Path("4_train/raw/loose") in times
         assert {p for p in logs if p.parts[0] != "0_fetch"} == times
+
+
+def test_the_workflow_is_lint_clean(project):
+    done = project.snakemake("--lint")
+    assert done.returncode == 0, done.stdout + done.stderr

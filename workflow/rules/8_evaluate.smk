@@ -1,14 +1,4 @@
 # dataset, captures, avatars -> metrics and report
-def evaluate_params(wildcards):
-    """The section with every source's held-out cameras; the evaluation spans all sources."""
-    held_out = {
-        name: list(source.held_out_views)
-        for name, source in CONFIG.sources.items()
-        if source.held_out_views
-    }
-    return params_json("evaluate", None, {"held_out_views": held_out})
-
-
 rule evaluate:
     input:
         dataset="results/7_assemble/{dataset}",

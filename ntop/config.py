@@ -230,6 +230,12 @@ class TrainConfig(Section):
     entropy_weight: float = Field(
         default=0.02, ge=0, description="Pushes rays towards opaque or empty."
     )
+    body_weight: float = Field(
+        default=0.0,
+        ge=0,
+        description="Pull of density towards the body's own surface: what few "
+        "rays see stays the body.",
+    )
     camera_colour: bool = Field(
         default=False, description="Learn a gain and bias per camera, for real captures."
     )

@@ -213,6 +213,17 @@ def refined_grid(grid: CanonicalGrid, occupancy: Occupancy, *, voxel_m: float) -
     return CanonicalGrid(values, bricks, positions, grid.origin, voxel_m)
 
 
+def body_density(body: CanonicalGrid, grid: CanonicalGrid) -> Float[np.ndarray, " row"]:
+    """Raw density of the body's own grid at the nodes of another one.
+
+    Where the body's shell has no brick, inside or out, nothing is known: the value is the one of
+    the shell's border, far from both.
+    """
+    values = void_values(len(grid.positions))
+    resample(body.tables(), grid.positions, grid.origin, grid.voxel_m, values)
+    return np.ascontiguousarray(np.clip(values[:, 0], *RAW_BOUNDS))
+
+
 def occupied_cells(grid: CanonicalGrid, *, raw_threshold: float, dilation: int) -> Occupancy:
     """Cells in which the field's raw density may exceed a threshold, grown by whole cells."""
     spacing = OCCUPANCY_SPACING_M

@@ -15,6 +15,7 @@ from ntop.body.skinning import BodyPose
 from ntop.field.avatar import Avatar
 from ntop.field.canonical import (
     CanonicalBody,
+    body_density,
     canonical_body,
     initial_grid,
     occupied_cells,
@@ -32,6 +33,7 @@ WATCHED_RAYS = 16384
 BETAS = (0.9, 0.99)
 VALUE_BOUNDS = ((-12.0, -8.0, -8.0, -8.0), (30.0, 8.0, 8.0, 8.0))
 TINY_MSE = 1e-10
+BODY_VOXEL_M = 0.008  # of the body's own density, which others are anchored to
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class TrainingSettings:
     density_smoothness: float = 5e-5
     colour_smoothness: float = 2e-5
     smooth_all_every: int = 25
+    body_weight: float = 0.0
     occupancy_every: int = 100
     occupied_raw: float = -4.0
     watch_every: int = 250
@@ -113,7 +116,7 @@ def train(
     watched = _watched_rays(views, origins, settings)
     state = checkpoint_path and load_checkpoint(checkpoint_path, settings, Progress)
     state = state or initial_state(body, len(views.cameras), settings)
-    trainer = _Trainer(state, warps, settings)
+    trainer = _Trainer(state, warps, settings, body)
     while trainer.state.step < settings.steps and not _stalled(trainer.state.curve, settings):
         trainer.step(source, watched)
         state = trainer.state
@@ -164,9 +167,16 @@ class _Trainer:
     """The buffers of one level and the loop over them; `state` is all that a checkpoint needs."""
 
     def __init__(
-        self, state: TrainingState, warps: list[PoseWarp], settings: TrainingSettings
+        self,
+        state: TrainingState,
+        warps: list[PoseWarp],
+        settings: TrainingSettings,
+        body: CanonicalBody,
     ) -> None:
         self.state = state
+        self._body_grid = initial_grid(
+            body, voxel_m=BODY_VOXEL_M, outer_m=settings.outer_m, inner_m=settings.inner_m
+        )
         self._warps = warps
         self._settings = settings
         self._tables = joined([occupied(warp, state.occupancy) for warp in warps])
@@ -176,6 +186,7 @@ class _Trainer:
         rows, slots = len(self.state.grid.values), len(self.state.grid.positions)
         blocks = self._settings.ray_blocks
         self._gradients = np.zeros((blocks, rows, 4), np.float32)
+        self._anchors = body_density(self._body_grid, self.state.grid)
         self._touched = np.zeros((blocks, slots), np.uint8)
 
     def step(self, source: RaySource, watched: RayBatch | None) -> None:
@@ -227,7 +238,8 @@ class _Trainer:
         smooth = np.array([settings.density_smoothness, *[settings.colour_smoothness] * 3])
         gather(
             state.grid.values, state.grid.bricks, state.grid.positions, active, self._gradients,
-            self._touched, smooth, np.array([0.5, 0.1, 0.1, 0.1]),
+            self._touched, smooth, np.array([0.5, 0.1, 0.1, 0.1]), self._anchors,
+            settings.body_weight,
         )  # fmt: skip
         low, high = (np.array(bound) for bound in VALUE_BOUNDS)
         adam_step(

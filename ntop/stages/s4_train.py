@@ -101,6 +101,7 @@ def training_settings(config: TrainConfig) -> TrainingSettings:
         density_smoothness=config.density_smoothness,
         colour_smoothness=config.colour_smoothness,
         entropy_weight=config.entropy_weight,
+        body_weight=config.body_weight,
         camera_colour=config.camera_colour,
     )
 

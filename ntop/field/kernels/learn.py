@@ -24,16 +24,20 @@ def neighbour_row(bricks, position, i, j, k):
 
 
 @kernel
-def gather(values, bricks, positions, active, gradients, touched, smoothness, edge):
+def gather(
+    values, bricks, positions, active, gradients, touched, smoothness, edge, anchors, anchor_weight
+):  # fmt: skip
     """Sum each active brick's gradients into block 0 and add the smoothness prior's.
 
     The prior is sum over neighbours of sqrt(difference^2 + edge^2) per channel: total variation
-    with a rounded tip. Only reads `values`, so bricks may run in any order.
+    with a rounded tip. The same form pulls raw density towards its anchor, so that what no ray
+    sees stays the body itself. Only reads `values`, so bricks may run in any order.
 
     Args:
         positions: (bricks, 3) brick coordinates. active: (any,) slots to visit.
         gradients: (blocks, rows, 4); blocks other than 0 are left zero. touched: likewise.
         smoothness: (4,) weight per channel. edge: (4,) width of the rounded tip per channel.
+        anchors: (rows,) raw density of the body itself. anchor_weight: of the pull to it.
     """
     blocks = gradients.shape[0]
     for a in numba.prange(active.shape[0]):
@@ -50,6 +54,10 @@ def gather(values, bricks, positions, active, gradients, touched, smoothness, ed
             for j in range(4):
                 for k in range(4):
                     row = slot * 64 + ((i << 4) | (j << 2) | k)
+                    off = values[row, 0] - anchors[row]
+                    gradients[0, row, 0] += (
+                        anchor_weight * off / math.sqrt(off * off + edge[0] ** 2)
+                    )
                     for n in range(6):
                         dx, dy, dz = NEIGHBOURS[n]
                         other = neighbour_row(bricks, positions[slot], i + dx, j + dy, k + dz)

@@ -1,0 +1,94 @@
+"""The real networks on a real frame, where the packages were fetched; choices without them."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ntop.config import MaskConfig
+from ntop.conventions import DataError
+from ntop.masks.landmarks import intersection_over_union
+from ntop.masks.network import Network
+from ntop.masks.polygons import read_polygon_masks
+from ntop.masks.segmentation import segment_person
+from ntop.masks.tracking import Networks, follow_person
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = Path(os.environ.get("NTOP_PACKAGES", ROOT / "data" / "packages"))
+REFERENCE = ROOT / "config" / "reference_masks" / "balancing_cam04.json"
+LEFT_HIP, RIGHT_HIP = 23, 24
+
+
+def video_of(view):
+    found = sorted(PACKAGES.glob(f"**/*BalancingTrial/videos/{view}.mp4"))
+    return found[0] if found else None
+
+
+needs_packages = pytest.mark.skipif(
+    not (PACKAGES / MaskConfig().detector).exists() or video_of("cam02") is None,
+    reason=f"no fetched packages in {PACKAGES} (set NTOP_PACKAGES, or run `ntop fetch`)",
+)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    config = MaskConfig()
+    return Networks(Network(PACKAGES / config.detector), Network(PACKAGES / config.landmarks))
+
+
+def frame_of(view, index):
+    video = cv2.VideoCapture(str(video_of(view)))
+    for _ in range(index + 1):
+        assert video.grab()
+    return cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)
+
+
+@needs_packages
+def test_a_reference_frame_is_segmented(networks):
+    image = frame_of("cam04", 11)
+    sighting = follow_person(networks, image, None)
+    found = segment_person(image, sighting, plate=None)
+    truth = read_polygon_masks(REFERENCE)[11]
+    assert found.reason == "" and found.confidence > 0.9
+    assert intersection_over_union(found.matte >= 0.5, truth) > 0.92
+    confident = sighting.pose.confidence[:33] > 0.5
+    u, v = np.floor(sighting.pose.landmarks_px[:33][confident]).astype(int).T
+    assert truth[v, u].mean() > 0.9
+    # seen from behind: his left is on the left of the picture
+    left, right = sighting.pose.landmarks_px[[LEFT_HIP, RIGHT_HIP], 0]
+    assert left < right
+
+
+@needs_packages
+def test_the_bystander_never_becomes_the_person(networks):
+    image = frame_of("cam02", 0)
+    sighting = follow_person(networks, image, None)
+    region = sighting.pose.next_region
+    assert abs(region.centre_u_px - 565) < 40 and region.side_px > 850
+    # once the actor is painted out there is nobody, although she is still there
+    matte = segment_person(image, sighting, plate=None).matte
+    gone = cv2.dilate((matte > 0).astype(np.uint8), np.ones((41, 41), np.uint8))
+    without = image.copy()
+    without[gone > 0] = 128
+    lost = follow_person(networks, without, sighting.pose)
+    assert lost.pose is None and lost.reason
+
+
+@needs_packages
+def test_a_jump_of_the_person_is_refused(networks):
+    image = frame_of("cam04", 11)
+    pose = follow_person(networks, image, None).pose
+    elsewhere = replace(pose.next_region, centre_u_px=pose.next_region.centre_u_px + 900)
+    lost = follow_person(networks, image, replace(pose, next_region=elsewhere))
+    assert lost.pose is None and lost.reason
+
+
+def test_a_missing_or_damaged_network_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"missing\.tflite"):
+        Network(tmp_path / "missing.tflite")
+    (tmp_path / "damaged.tflite").write_bytes(b"no network")
+    with pytest.raises(DataError, match=r"damaged\.tflite"):
+        Network(tmp_path / "damaged.tflite")

@@ -230,6 +230,12 @@ class TrainConfig(Section):
     entropy_weight: float = Field(
         default=0.02, ge=0, description="Pushes rays towards opaque or empty."
     )
+    matte_weight: float = Field(
+        default=1.0, ge=0, description="How much the matte counts beside the colours."
+    )
+    matte_edge_weight: float = Field(
+        default=0.5, ge=0, description="How much it counts along the person's outline."
+    )
     body_weight: float = Field(
         default=0.0,
         ge=0,

@@ -31,6 +31,7 @@ from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, wor
 STAGE = "train"
 CHECKPOINT_NAME = "checkpoint.safetensors"
 REPORT_EVERY_S = 5.0
+COLOUR_EDGE_WEIGHT = 0.2  # colours along an outline are mixed with the scene behind it
 
 
 def main(
@@ -101,6 +102,8 @@ def training_settings(config: TrainConfig) -> TrainingSettings:
         density_smoothness=config.density_smoothness,
         colour_smoothness=config.colour_smoothness,
         entropy_weight=config.entropy_weight,
+        matte_weight=config.matte_weight,
+        band_weights=(COLOUR_EDGE_WEIGHT, config.matte_edge_weight),
         body_weight=config.body_weight,
         camera_colour=config.camera_colour,
     )

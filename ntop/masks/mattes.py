@@ -3,14 +3,16 @@
 The network's segmentation has a pixel of about 1/256 of the person's region, four to five pixels of
 the frame. The guided filter (He, Sun and Tang 2013) fits it, window by window, by a linear function
 of the frame's colours, so that its edge moves onto the edge in the picture. Where the scene behind
-the person is known (plates.py), it first decides what is scene.
+the person is known (plates.py), it first decides what is scene; last, the outline's pixels are
+split between person and scene by their colour (edges.py).
 """
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from ntop.masks.plates import SHOWS_SCENE, Plate, person_log_odds, with_evidence
+from ntop.masks.edges import mixed_edges
+from ntop.masks.plates import MIN_FRAMES, SHOWS_SCENE, Plate, person_log_odds, with_evidence
 from ntop.masks.regions import box_around
 
 GUIDE_EPSILON = 1e-4  # colour variance (of [0, 1]) below which a window counts as flat
@@ -29,20 +31,23 @@ def sharpen_matte(
 ) -> Float32[np.ndarray, "height width"]:
     """The matte whose edges follow the picture's, from a probability image in 1/255.
 
-    `radius_px` is the reach of the correction: about two pixels of the coarse segmentation. With a
-    plate of the scene the edges are already right within a pixel or two, and half of it does.
+    `radius_px` is the reach of the correction: about two pixels of the coarse segmentation.
     """
     matte = np.zeros(person.shape, np.float32)
     box = box_around(person > 255 * SHOWS_SCENE, margin_px=MARGIN_WINDOWS * radius_px)
     if box is None:
         return matte
     coarse = person[box].astype(np.float32) / 255
+    scene, known = image[box].astype(np.float32), np.zeros(coarse.shape, bool)
     if plate is not None:
         coarse = with_evidence(coarse, person_log_odds(image, plate, box=box))
-        radius_px = max(1, radius_px // 2)
+        scene, known = plate.colour[box], plate.frames[box] >= MIN_FRAMES
+    # half the reach: a wide window takes fingers and wrists away
+    half_px = max(1, radius_px // 2)
     guide = image[box].astype(np.float32) / 255
-    fitted = cv2.ximgproc.guidedFilter(guide, coarse, radius_px, GUIDE_EPSILON)
-    matte[box] = np.clip((fitted - 0.5) * STEEPNESS + 0.5, 0, 1)
+    fitted = cv2.ximgproc.guidedFilter(guide, coarse, half_px, GUIDE_EPSILON)
+    sharp = np.clip((fitted - 0.5) * STEEPNESS + 0.5, 0, 1)
+    matte[box] = mixed_edges(image[box], sharp, scene=scene, scene_known=known, depth_px=half_px)
     return matte
 
 

@@ -13,6 +13,7 @@ from ntop.conventions import DataError
 from ntop.masks.landmarks import intersection_over_union
 from ntop.masks.network import Network
 from ntop.masks.polygons import read_polygon_masks
+from ntop.masks.regions import box_around
 from ntop.masks.segmentation import segment_person
 from ntop.masks.tracking import Networks, follow_person
 
@@ -68,11 +69,10 @@ def test_the_bystander_never_becomes_the_person(networks):
     sighting = follow_person(networks, image, None)
     region = sighting.pose.next_region
     assert abs(region.centre_u_px - 565) < 40 and region.side_px > 850
-    # once the actor is painted out there is nobody, although she is still there
-    matte = segment_person(image, sighting, plate=None).matte
-    gone = cv2.dilate((matte > 0).astype(np.uint8), np.ones((41, 41), np.uint8))
+    # once the actor is covered there is nobody, although she is still there
+    box = box_around(segment_person(image, sighting, plate=None).matte > 0, margin_px=10)
     without = image.copy()
-    without[gone > 0] = 128
+    without[box] = 128
     lost = follow_person(networks, without, sighting.pose)
     assert lost.pose is None and lost.reason
 

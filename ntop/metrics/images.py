@@ -25,6 +25,20 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
 @dataclass(frozen=True)
+class Window:
+    """Half-open pixel ranges [top, bottom) x [left, right)."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """That part of an image."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+
+@dataclass(frozen=True)
 class Cutout:
     """A person cut out of an image: straight colour and alpha, both in [0, 1]."""
 
@@ -42,24 +56,14 @@ class Cutout:
         """The person's pixels."""
         return self.alpha >= MASK_ALPHA / 255
 
+    def within(self, window: Window) -> "Cutout":
+        """That part of the cut-out."""
+        return Cutout(window.of(self.rgb), window.of(self.alpha))
+
     def on_grey(self) -> Float[np.ndarray, "height width 3"]:
         """Composited on grey 127, in the stored (gamma) space."""
         alpha = self.alpha[..., None]
         return self.rgb * alpha + GREY * (1 - alpha)
-
-
-@dataclass(frozen=True)
-class Window:
-    """Half-open pixel ranges [top, bottom) x [left, right)."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    def of(self, image: np.ndarray) -> np.ndarray:
-        """That part of an image."""
-        return image[self.top : self.bottom, self.left : self.right]
 
 
 def tight_window(mask: Bool[np.ndarray, "height width"]) -> Window:

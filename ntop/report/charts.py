@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 WIDTH, HEIGHT = 640, 300
+DOTTED = 20  # curves of so few values show each; a single one would be no line
 LEFT, RIGHT, TOP, BOTTOM = 62, 16, 18, 44
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve; `kind` selects its colour and dashes (0, 1, 2, ...)."""
+    """One curve; `kind` selects its colour (0 to 3)."""
 
     name: str
     x: list[float]
     y: list[float]
     kind: int = 0
-    dots: bool = False
 
 
 def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> str:
@@ -52,13 +52,12 @@ def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> 
     for line, points in zip(lines, finite, strict=True):
         placed = [at(p) for p in points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in placed)
-        if line.dots:
+        parts.append(f'<polyline class="curve k{line.kind}" points="{path}"/>')
+        if len(placed) <= DOTTED:
             parts += [
-                f'<circle class="dot k{line.kind}" cx="{x:.1f}" cy="{y:.1f}" r="4"/>'
+                f'<circle class="dot k{line.kind}" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>'
                 for x, y in placed
             ]
-        else:
-            parts.append(f'<polyline class="curve k{line.kind}" points="{path}"/>')
     x_middle, y_middle = (LEFT + WIDTH - RIGHT) / 2, (TOP + HEIGHT - BOTTOM) / 2
     parts.append(f'<text x="{x_middle}" y="{HEIGHT - 6}" class="axis mid">{_safe(x_label)}</text>')
     parts.append(

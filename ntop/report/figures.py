@@ -91,7 +91,7 @@ MEANINGS = (
     ),
     Meaning(
         "heldout.baseline_psnr_person_db", "held-out camera, painted body", "dB",
-        "The same body painted in its mean part colours: what the avatar must beat by 2 dB.",
+        "The same body painted in its mean part colours: what the avatar must beat.",
     ),
     Meaning(
         "truth.psnr_person_db", "top view, person", "dB",
@@ -127,6 +127,18 @@ MEANINGS = (
     Meaning("dataset.images", "images", "", "Rows of the manifest."),
 )  # fmt: skip
 CHECKS = (
+    Meaning(
+        "refine_cameras.bone_length_std_mm", "bone lengths", "mm",
+        "Largest standard deviation of a triangulated bone's length over the frames.", at_most=15,
+    ),
+    Meaning(
+        "heldout.gain_person_db", "avatar over painted body, held-out", "dB",
+        "How much better than the painted body the avatar shows the person.", at_least=2,
+    ),
+    Meaning(
+        "truth.gain_box_db", "avatar over painted body, top view", "dB",
+        "The same in the box of the fisheye views with known truth.", at_least=7,
+    ),
     Meaning(
         "checks.coco_self_ap", "COCO files", "",
         "Lowest average precision of an annotation file evaluated against itself.", at_least=1,

@@ -58,6 +58,7 @@ def heldout_values(scores: HeldoutScores) -> dict[str, float | None]:
         "heldout.ssim_box": mean.ssim_box,
         "heldout.mask_iou": mean.mask_iou,
         "heldout.baseline_psnr_person_db": mean.baseline_psnr_person_db,
+        "heldout.gain_person_db": mean.psnr_person_db - mean.baseline_psnr_person_db,
     }
 
 

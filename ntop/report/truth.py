@@ -9,8 +9,9 @@ import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
 from ntop.body.skinning import BodyPose
+from ntop.conventions import MASK_ALPHA
 from ntop.geometry.cameras import Camera
-from ntop.metrics.images import Cutout
+from ntop.metrics.images import Cutout, tight_window
 from ntop.report.capture import pose_of
 from ntop.report.gallery import DIRECTIONS
 from ntop.report.inputs import ActorFolders, Dataset
@@ -56,14 +57,15 @@ def score_truth(dataset: Dataset, actor: ActorFolders, *, paint: Painter) -> Tru
         if row["sample_id"] not in truth:
             continue
         true_row = truth[row["sample_id"]]
-        reference = Cutout.from_rgba(_true_image(actor, true_row))
-        if not reference.mask.any():
+        true_rgba, rgba = _true_image(actor, true_row), read_rgba(dataset.image_path(row))
+        if not (true_rgba[..., 3] >= MASK_ALPHA).any():
             continue
-        image = Cutout.from_rgba(read_rgba(dataset.image_path(row)))
         # the truth's camera and pose: the baseline must not profit from an error of ours
-        baseline = paint(pose_of(true_row), fisheye_camera(true_row))
+        painted = paint(pose_of(true_row), fisheye_camera(true_row))
+        window = tight_window((true_rgba[..., 3] > 0) | (rgba[..., 3] > 0))
+        image, reference = (Cutout.from_rgba(window.of(x)) for x in (rgba, true_rgba))
         rows.append(row)
-        scores.append(score_image(image, reference, baseline=baseline))
+        scores.append(score_image(image, reference, baseline=painted.within(window)))
     if not rows:
         return None
     return TruthScores(tuple(rows), tuple(scores), _visibility_agreement(actor, rows))
@@ -78,6 +80,7 @@ def truth_values(scores: TruthScores) -> dict[str, float | None]:
         "truth.ssim_box": mean.ssim_box,
         "truth.mask_iou": mean.mask_iou,
         "truth.baseline_psnr_box_db": mean.baseline_psnr_box_db,
+        "truth.gain_box_db": mean.psnr_box_db - mean.baseline_psnr_box_db,
         "truth.visibility_agreement": scores.visibility_agreement,
     }
 

@@ -140,6 +140,17 @@ def test_between_samples_a_joint_turns_at_constant_speed(tmp_path):
     torch.testing.assert_close(angles, expected, atol=1e-9, rtol=0)
 
 
+def test_half_turns_are_crossed_the_short_way(tmp_path):
+    frames = [
+        frame(**{f"at_{ROOT_TURN}": quaternion((0, 1, 0), angle)}) for angle in (170.0, 190.0)
+    ]
+    motion = load_motion(write_clip(tmp_path / "turn.txt", frames))
+    sample = sample_motion(motion, torch.tensor([0.05], dtype=torch.float64))
+    forward = matrix_from_quaternion(sample.quaternions[0, 0])[:, 2]
+    expected = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # half a turn from -y
+    torch.testing.assert_close(forward, expected, atol=1e-9, rtol=0)
+
+
 # --- DeepMimic files, written here in their layout ------------------------------------------------
 
 
@@ -193,6 +204,23 @@ def test_shoulder_chest_and_root_rotations_change_basis(tmp_path):
     trunk = joints[JOINT["neck"]] - joints[JOINT["spine3"]]
     lean = math.degrees(math.atan2(-trunk[1], trunk[2]))
     assert abs(lean - 60) < 3  # the resting neck is not exactly above the chest
+
+
+def test_a_frame_lasts_as_long_as_its_own_column_says(tmp_path):
+    frames = [
+        frame(duration_s=0.1),
+        frame(duration_s=0.3, at_1=[0.1, 0.85, 0.0]),
+        frame(duration_s=0.0, at_1=[0.4, 0.85, 0.0]),  # the last one's does not count
+    ]
+    motion = load_motion(write_clip(tmp_path / "uneven.txt", frames))
+    assert motion.times_s.tolist() == pytest.approx([0.0, 0.1, 0.4])
+
+
+def test_a_clip_starts_over_the_origin_wherever_it_was_recorded(tmp_path):
+    rows = [frame(at_1=[x, 0.85, 7.0]) for x in (3.0, 3.5)]
+    pelvis = joints_of(write_clip(tmp_path / "far.txt", rows), 0.0, 0.1)[:, 0]
+    assert pelvis[0, :2].abs().max() < 1e-5
+    assert -0.55 < pelvis[1, 1] < -0.45
 
 
 def walk(tmp_path: Path, *, loop: str) -> Path:

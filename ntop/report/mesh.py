@@ -55,9 +55,9 @@ class PaintedBody:
                 (drawing.corners_px - low) * SAMPLES,
                 colours,
                 size=(rows * SAMPLES, columns * SAMPLES),
-            )
-            blocks = fine.reshape(rows, SAMPLES, columns, SAMPLES, 4).astype(np.float64) / 255
-            mean = blocks.mean((1, 3))  # colour is zero where alpha is: premultiplied
+            ).astype(np.float32)
+            # the mean of each pixel's samples; colour is zero where alpha is: premultiplied
+            mean = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA) / 255
             mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
             rgba[top : top + rows, left : left + columns] = mean
         return Cutout(rgba[..., :3], rgba[..., 3])

@@ -207,7 +207,9 @@ class FitConfig(Section):
     )
     min_confidence: float = Field(default=0.3, ge=0, le=1, description="Of a keypoint to count.")
     landmark_spread_px: float = Field(default=6.0, gt=0, description="The detector's noise.")
-    silhouettes: bool = Field(default=True, description="Fit the mattes' borders as well.")
+    silhouettes: bool = Field(
+        default=True, description="Fit the mattes' borders as well; not for loose garments."
+    )
 
 
 class TrainConfig(Section):

@@ -38,7 +38,8 @@ def true_joints_world_m(actor: str, motion: str, frames: list[int]) -> np.ndarra
     model = load_body_model()
     dressed = dress_actor(actor, model)
     times_s = torch.tensor(frames, dtype=torch.float64) / 30
-    pose = retarget(authored_motion(motion), model, dressed.betas, frame_times_s=times_s)
+    betas = torch.from_numpy(dressed.betas)
+    pose = retarget(authored_motion(motion), model, betas, frame_times_s=times_s)
     return pose_joints(model, pose).numpy()
 
 

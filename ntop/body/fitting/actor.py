@@ -21,8 +21,8 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.geometry.triangulation import Triangulation
 
-CANDIDATE_CELL_M = 0.03
-CONTOUR_REACH_PX = (60.0, 40.0, 25.0, 15.0)  # per round; the last decides what counts as matched
+CANDIDATE_CELL_M = 0.02
+CONTOUR_REACH_M = (0.12, 0.08, 0.05, 0.03)  # per round; the last decides what counts as matched
 MAX_SMOOTH_STEP = 5  # frames further apart say nothing about each other
 
 
@@ -73,10 +73,8 @@ def fit_actor(
         candidates = candidate_vertices(model, cell_m=CANDIDATE_CELL_M)
         problem = replace(problem, model=reduced_model(model, candidates))
         full = model.to(fit.pose.transl)
-        for reach_px in CONTOUR_REACH_PX:
-            contours = match_contours(
-                full, fit.pose, views, candidates=candidates, reach_px=reach_px
-            )
+        for reach_m in CONTOUR_REACH_M:
+            contours = match_contours(full, fit.pose, views, candidates=candidates, reach_m=reach_m)
             fit = fit_contours(problem, fit, rays, contours)
     return _measured(problem, fit, found)
 

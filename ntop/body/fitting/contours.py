@@ -5,6 +5,7 @@ the body lies beyond. Matching and fitting alternate (Besl & McKay 1992), in bot
 border point without body pulls it out, a rim vertex outside the matte pulls it in.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -22,12 +23,16 @@ from ntop.conventions import MASK_ALPHA, NUM_JOINTS
 from ntop.geometry.cameras import Camera
 from ntop.geometry.refinement import pixels_per_radian
 
-SPACING_PX = 14
+# Of the diagonal of the matte's box, which a person fills alike in every camera
+SPACING_SHARE, SMOOTHING_SHARE = 1 / 75, 1 / 350
+MIN_SPACING_PX, MIN_SMOOTHING_PX = 2, 0.7
+MIN_CURVE_POINTS = 8
 FRAME_EDGE_PX = 4  # a border there is the picture's, not the person's
-SMOOTHING_PX = 3.0
-RIM_COSINE = 0.35
-SPLAT_SCALE = 0.25
-NORMAL_WEIGHT_PX = 60.0  # opposite normals lie as far apart as points 120 px away
+RIM_COSINE = 0.15  # wider, vertices short of the rim fatten the body by 3 mm
+# At the body, in metres: the same on a large and on a small picture
+NORMAL_WEIGHT_M = 0.12  # opposite normals lie as far apart as points twice that away
+BEYOND_M = 0.024
+SPLAT_CELL_M = 0.008
 
 
 @dataclass(frozen=True)
@@ -48,11 +53,17 @@ class View:
 
 
 def matte_border(matte: Float[ndarray, "height width"]) -> Border:
-    """Points along the matte's half level, `SPACING_PX` apart, holes included."""
-    smooth = cv2.GaussianBlur(matte, (0, 0), SMOOTHING_PX)
+    """Points along the matte's half level, some 75 to 200 around a person, holes included."""
+    rows, columns = (np.nonzero((matte >= 0.5).any(axis))[0] for axis in (1, 0))
+    if not len(rows):
+        return Border(np.zeros((0, 2)), np.zeros((0, 2)))
+    diagonal_px = math.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1)
+    spacing = max(MIN_SPACING_PX, round(SPACING_SHARE * diagonal_px))
+    smooth = cv2.GaussianBlur(matte, (0, 0), max(MIN_SMOOTHING_PX, SMOOTHING_SHARE * diagonal_px))
     person = (smooth >= MASK_ALPHA / 255).astype(np.uint8)
     curves, _ = cv2.findContours(person, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    picked = [curve[::SPACING_PX, 0] for curve in curves if len(curve) >= 8 * SPACING_PX]
+    long = [curve for curve in curves if len(curve) >= MIN_CURVE_POINTS * spacing]
+    picked = [curve[::spacing, 0] for curve in long]
     cells = np.concatenate(picked) if picked else np.zeros((0, 2), np.int32)
     height, width = matte.shape
     edge = FRAME_EDGE_PX
@@ -76,7 +87,7 @@ def match_contours(
     views: list[View],
     *,
     candidates: Int[Tensor, " candidate"],
-    reach_px: float,
+    reach_m: float,
 ) -> ContourRays:
     """Which candidate vertex should meet which border point; fit points count joints first."""
     parts: list[tuple[Tensor, ...]] = []
@@ -90,9 +101,7 @@ def match_contours(
         vertices = pose_body(model, single).vertices
         normals = _vertex_normals(vertices, model.faces)
         for view in by_frame[frame]:
-            vertex, point = _match(
-                view, vertices, normals, candidates=candidates, reach_px=reach_px
-            )
+            vertex, point = _match(view, vertices, normals, candidates=candidates, reach_m=reach_m)
             parts.append(_as_rays(view, vertex, point))
     joined = [torch.cat(column) for column in zip(*parts, strict=True)]
     return ContourRays(*joined)
@@ -113,7 +122,7 @@ def _match(
     normals: Float[Tensor, "vertex 3"],
     *,
     candidates: Int[Tensor, " candidate"],
-    reach_px: float,
+    reach_m: float,
 ) -> tuple[ndarray, ndarray]:
     """Pairs (index into candidates, index into border points)."""
     camera, border = view.camera, view.border
@@ -121,16 +130,22 @@ def _match(
     toward = torch.nn.functional.normalize(camera.center_world - chosen, dim=-1)
     grazing = ((outward * toward).sum(-1).abs() < RIM_COSINE).numpy()
     pixels = camera.project(vertices)[0].numpy()
+    distance_m = float((vertices.mean(0) - camera.center_world).norm())
+    px_per_m = pixels_per_radian(camera.lens) / distance_m
     here = pixels[candidates.numpy()]
     there = camera.project(chosen + 0.02 * outward)[0].numpy()
     direction = there - here
     direction /= np.linalg.norm(direction, axis=1, keepdims=True).clip(1e-9)
-    rim = np.nonzero(grazing & _beyond_body(pixels, here + 12 * direction, camera))[0]
+    rim = np.nonzero(
+        grazing
+        & _beyond_body(pixels, here + BEYOND_M * px_per_m * direction, camera, px_per_m=px_per_m)
+    )[0]
     if not len(rim) or not len(border.points_px):
         empty = np.zeros(0, np.int64)
         return empty, empty
-    rim_features = np.hstack([here[rim], NORMAL_WEIGHT_PX * direction[rim]])
-    features = np.hstack([border.points_px, NORMAL_WEIGHT_PX * border.normals])
+    weight_px, reach_px = NORMAL_WEIGHT_M * px_per_m, reach_m * px_per_m
+    rim_features = np.hstack([here[rim], weight_px * direction[rim]])
+    features = np.hstack([border.points_px, weight_px * border.normals])
     distance, nearest = cKDTree(rim_features).query(features)
     ours = distance < reach_px
     back, nearest_point = cKDTree(features).query(rim_features)
@@ -141,21 +156,26 @@ def _match(
 
 
 def _beyond_body(
-    pixels: Float[ndarray, "vertex 2"], points: Float[ndarray, "point 2"], camera: Camera
+    pixels: Float[ndarray, "vertex 2"],
+    points: Float[ndarray, "point 2"],
+    camera: Camera,
+    *,
+    px_per_m: float,
 ) -> ndarray:
     """Which points lie outside the body's image, drawn coarsely from its vertices."""
-    width = round(camera.lens.width * SPLAT_SCALE)
-    height = round(camera.lens.height * SPLAT_SCALE)
+    cells_per_px = min(1.0, 1 / (SPLAT_CELL_M * px_per_m))
+    width = round(camera.lens.width * cells_per_px)
+    height = round(camera.lens.height * cells_per_px)
     image = np.zeros((height, width), np.uint8)
 
     def inside(cells: ndarray) -> ndarray:
         return (cells >= 0).all(1) & (cells[:, 0] < width) & (cells[:, 1] < height)
 
-    cells = np.floor(pixels * SPLAT_SCALE).astype(np.int64)
+    cells = np.floor(pixels * cells_per_px).astype(np.int64)
     cells = cells[inside(cells)]
     image[cells[:, 1], cells[:, 0]] = 1
     image = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    wanted = np.floor(points * SPLAT_SCALE).astype(np.int64)
+    wanted = np.floor(points * cells_per_px).astype(np.int64)
     visible = inside(wanted)
     wanted = np.where(visible[:, None], wanted, 0)
     return visible & (image[wanted[:, 1], wanted[:, 0]] == 0)
@@ -169,7 +189,6 @@ def _as_rays(view: View, vertex: ndarray, point: ndarray) -> tuple[Tensor, ...]:
     direction, valid = camera.rays(pixels)
     beside, _ = camera.rays(pixels + normals)
     normal = beside - (beside * direction).sum(-1, keepdim=True) * direction
-    scale = pixels_per_radian(camera.lens)
     count = len(point)
     return (
         torch.full((count,), view.frame),
@@ -177,7 +196,6 @@ def _as_rays(view: View, vertex: ndarray, point: ndarray) -> tuple[Tensor, ...]:
         camera.center_world.expand(count, 3),
         direction,
         torch.nn.functional.normalize(normal, dim=-1),
-        torch.full((count,), scale, dtype=torch.float64),
         valid.double(),
     )
 

@@ -40,7 +40,7 @@ class ContourRays:
         vertex: which fit point it should meet.
         center_world, direction_world: its ray.
         normal_world: unit, across the ray, out of the silhouette: sliding along the border is free.
-        scale_px: pixels per radian; weights: >= 0.
+        weights: >= 0.
     """
 
     frame: Int[Tensor, " point"]
@@ -48,7 +48,6 @@ class ContourRays:
     center_world: Float[Tensor, "point 3"]
     direction_world: Float[Tensor, "point 3"]
     normal_world: Float[Tensor, "point 3"]
-    scale_px: Float[Tensor, " point"]
     weights: Float[Tensor, " point"]
 
 
@@ -84,10 +83,9 @@ def landmark_misses_px(
     return distance * rays.scale_px[..., None]
 
 
-def contour_misses_px(
+def contour_misses_m(
     rays: ContourRays, points_world: Float[Tensor, "frame point 3"]
 ) -> Float[Tensor, " contour"]:
-    """Signed miss of each contour point across the border, in pixels; positive is outside."""
+    """Signed miss of each contour point across the border, in metres; positive is outside."""
     offset = points_world[rays.frame, rays.vertex] - rays.center_world
-    along = (offset * rays.direction_world).sum(-1).clamp(min=0.1)
-    return (offset * rays.normal_world).sum(-1) / along * rays.scale_px
+    return (offset * rays.normal_world).sum(-1)

@@ -1,7 +1,7 @@
 """The fit itself: one `betas` and all frames' poses at the maximum of one log-likelihood.
 
 Terms, each a sum of squared misses over spreads: triangulated landmarks (to get near), landmarks'
-rays in pixels, silhouettes' borders in pixels, pose and shape priors, smoothness between
+rays in pixels, silhouettes' borders in metres, pose and shape priors, smoothness between
 neighbouring frames. Observations are robust: a miss far beyond its spread stops pulling
 (Geman & McClure 1985). Smoothness is robust too, so that frames that do not follow each other in
 time, only in number, are not bent towards each other.
@@ -19,7 +19,7 @@ from ntop.body.fitting.initial import initial_pose
 from ntop.body.fitting.observations import (
     ContourRays,
     LandmarkRays,
-    contour_misses_px,
+    contour_misses_m,
     landmark_misses_px,
 )
 from ntop.body.fitting.priors import pose_penalty
@@ -43,7 +43,7 @@ class FitSettings:
 
     landmark_px: float = 6.0
     landmark_m: float = 0.03
-    contour_px: float = 4.0
+    contour_m: float = 0.008
     contour_weight: float = 0.5  # neighbouring border points are not independent
     betas: float = 1.5
     acceleration_m: float = 0.003  # second difference of a joint from frame to frame
@@ -107,7 +107,7 @@ def fit_contours(
     settings = problem.settings
 
     def cost(posed: PosedBody, points: Tensor) -> Tensor:
-        miss = contour_misses_px(contours, posed.vertices) / settings.contour_px
+        miss = contour_misses_m(contours, posed.vertices) / settings.contour_m
         border = (contours.weights * _robust(miss, knee=4.0)).sum()
         return ray_cost(rays, points, settings) + settings.contour_weight * border
 

@@ -22,12 +22,12 @@ from ntop.storage.renders import fisheye_camera
 
 RADIUS_M = 0.020
 RAYS_PER_SIDE = 8
-MARGIN_M = 0.012  # room around the ball: the grid's, and a pixel's worth of the picture's
+MARGIN_M = 0.006  # room around the ball, of the grid and of the picture
 VOXEL_M = 0.004
 CELL_M = 0.02
 RAW_PER_M = 6000.0  # opaque within a fraction of a millimetre
 RAW_LIMITS = (VOID_RAW, 30.0)
-SETTINGS = RenderSettings(step_m=0.0005, stop_transmittance=0.0, edge_rays=1)
+SETTINGS = RenderSettings(step_m=0.001, edge_rays=1)
 
 
 def blob_max_px(dataset: Dataset) -> float | None:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, UInt8
 
 from ntop.body.skinning import BodyPose
 from ntop.geometry.cameras import Camera
-from ntop.metrics.images import Cutout
+from ntop.metrics.images import Cutout, tight_window
 from ntop.report.capture import FrameKey, Recording
 from ntop.report.page import Comparison
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_image, score_table
@@ -19,11 +19,21 @@ ReferenceMasks = dict[FrameKey, Bool[np.ndarray, "height width"]]
 
 
 @dataclass(frozen=True)
+class Compared:
+    """One frame as 8-bit cut-outs in one window; kept, because rendering takes seconds."""
+
+    image: UInt8[np.ndarray, "height width 4"]
+    reference: UInt8[np.ndarray, "height width 4"]
+    baseline: UInt8[np.ndarray, "height width 4"]
+
+
+@dataclass(frozen=True)
 class HeldoutScores:
-    """Scores per frame of a held-out camera, in key order."""
+    """Scores and pictures per frame of a held-out camera, in key order."""
 
     keys: tuple[FrameKey, ...]
     scores: tuple[ImageScores, ...]
+    pictures: tuple[Compared, ...]
 
 
 def score_heldout(
@@ -35,18 +45,17 @@ def score_heldout(
     )
     if not keys:
         return None
-    pictures = recording.pictures(keys)
-    scores = []
+    photos = recording.pictures(keys)
+    scores, pictures = [], []
     for key in keys:
-        pose, camera = _seen(recording, key)
-        scores.append(
-            score_image(
-                render(pose, camera),
-                Cutout.from_rgba(_cut_out(pictures[key], references[key])),
-                baseline=paint(pose, camera),
-            )
-        )
-    return HeldoutScores(tuple(keys), tuple(scores))
+        action, frame, view = key
+        pose, camera = recording.pose((action, frame)), recording.cameras[action, view]
+        image, baseline = render(pose, camera), paint(pose, camera)
+        reference = Cutout.from_rgba(_cut_out(photos[key], references[key]))
+        scores.append(score_image(image, reference, baseline=baseline))
+        window = tight_window((image.alpha > 0) | reference.mask | (baseline.alpha > 0))
+        pictures.append(Compared(*(stored(c.within(window)) for c in (image, reference, baseline))))
+    return HeldoutScores(tuple(keys), tuple(scores), tuple(pictures))
 
 
 def heldout_values(scores: HeldoutScores) -> dict[str, float | None]:
@@ -62,25 +71,17 @@ def heldout_values(scores: HeldoutScores) -> dict[str, float | None]:
     }
 
 
-def heldout_comparison(
-    recording: Recording,
-    scores: HeldoutScores,
-    *,
-    references: ReferenceMasks,
-    render: Renderer,
-    paint: Painter,
-) -> Comparison:
+def heldout_comparison(recording: Recording, scores: HeldoutScores) -> Comparison:
     """Best, median and worst frame beside the real picture."""
     lines = []
     for name, index in best_median_worst(list(scores.scores)).items():
-        key = scores.keys[index]
-        pose, camera = _seen(recording, key)
-        action, frame, view = key
+        action, frame, view = scores.keys[index]
+        shown = scores.pictures[index]
         lines.append(
             compared(
-                image=stored(render(pose, camera)),
-                reference=_cut_out(recording.picture(key), references[key]),
-                baseline=stored(paint(pose, camera)),
+                image=shown.image,
+                reference=shown.reference,
+                baseline=shown.baseline,
                 scores=scores.scores[index],
                 names=(
                     f"{name} of {len(scores.keys)}: real picture, {view}, {action} frame {frame}",
@@ -101,11 +102,6 @@ def heldout_comparison(
         "part."
     )
     return Comparison(text, tuple(lines), score_table(groups, first="frame"))
-
-
-def _seen(recording: Recording, key: FrameKey) -> tuple[BodyPose, Camera]:
-    action, frame, view = key
-    return recording.pose((action, frame)), recording.cameras[action, view]
 
 
 def _cut_out(

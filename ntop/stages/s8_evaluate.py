@@ -109,9 +109,7 @@ def report_actor(
     found = score_heldout(recording, references, render=render, paint=paint)
     if found is not None:
         values |= heldout_values(found)
-        heldout = heldout_comparison(
-            recording, found, references=references, render=render, paint=paint
-        )
+        heldout = heldout_comparison(recording, found)
     true = score_truth(dataset, actor, paint=paint)
     if true is not None:
         values |= truth_values(true)

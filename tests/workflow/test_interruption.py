@@ -1,11 +1,13 @@
 """kill -9 of everything at random moments, then the same command again: the same bytes."""
 
-import os
+import contextlib
+import fcntl
 import random
 import signal
 import subprocess
 import time
 
+import psutil
 import pytest
 
 KILLS_PER_STAGE = 3
@@ -36,7 +38,11 @@ def kill_during(project, stage: str, delay_s: float) -> bool:
     time.sleep(delay_s)
     running = process.poll() is None
     if running:
-        os.killpg(process.pid, signal.SIGKILL)
+        # the jobs have process groups of their own: whoever pulls the plug stops them all
+        family = psutil.Process(process.pid)
+        for member in [family, *family.children(recursive=True)]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                member.send_signal(signal.SIGKILL)
         process.wait()
     return running
 
@@ -59,8 +65,6 @@ def test_a_killed_campaign_ends_with_the_same_dataset(campaign, project):
 def test_a_second_run_beside_a_running_one_is_refused(project):
     (project.folder / "results").mkdir()
     with (project.folder / "results/.run.lock").open("w") as lock:
-        import fcntl
-
         fcntl.flock(lock, fcntl.LOCK_EX)
         done = project.run()
     assert done.returncode != 0

@@ -7,7 +7,8 @@ shift 2
 # A killed run leaves its lock behind. Nobody else works here if no process holds the folder's lock.
 mkdir -p results
 exec 9>results/.run.lock
-if ! flock --nonblock 9; then
+# Jobs of a killed run hold it too until the kernel has buried them, hence the patience.
+if ! flock --timeout "${NTOP_LOCK_WAIT_S:-30}" 9; then
   echo "ntop: another run works in $PWD; wait for it, or stop it first" >&2
   exit 1
 fi

@@ -64,6 +64,7 @@ def test_a_killed_campaign_ends_with_the_same_dataset(campaign, project):
 
 def test_a_second_run_beside_a_running_one_is_refused(project):
     (project.folder / "results").mkdir()
+    project.environment["NTOP_LOCK_WAIT_S"] = "1"
     with (project.folder / "results/.run.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         done = project.run()

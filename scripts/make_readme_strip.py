@@ -42,7 +42,7 @@ def draw(panels: tuple[Panel, ...]) -> bytes:
         axis.set_title(panel.name, fontsize=10)
     figure.tight_layout(pad=0.3)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
+    figure.savefig(buffer, format="png", bbox_inches="tight", metadata={"Software": None})
     return buffer.getvalue()
 
 

@@ -1,5 +1,5 @@
 # make demo   real capture -> dataset -> report        make test   everything CI runs
-# make studio synthetic capture with known truth       make bench  run time against error
+# make studio synthetic capture with known truth       make lint   the checks without tests
 SHELL := /bin/bash
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint rulegraph clean-cache
+.PHONY: env demo studio test lint rulegraph
 
 env: $(VENV)/.ready
 

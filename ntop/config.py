@@ -222,13 +222,24 @@ class TrainConfig(Section):
     reach_m: float = Field(
         default=0.05, gt=0, description="How far off the body clothes and hair may be."
     )
+    sharpness: float = Field(
+        default=16.0,
+        ge=1,
+        description="How many times harder the surface ends than it began; "
+        "lower it where poses are measured, not given.",
+    )
+    warp_cell_mm: float = Field(
+        default=12.0,
+        gt=0,
+        description="Cells of the poses' warp grids: memory falls with its cube.",
+    )
     density_smoothness: float = Field(
-        default=5e-5,
+        default=3e-5,
         ge=0,
         description="Pull between neighbouring cells' densities; raise it "
         "where masks and poses are measured, not given.",
     )
-    colour_smoothness: float = Field(default=2e-5, ge=0, description="The same for colours.")
+    colour_smoothness: float = Field(default=2e-4, ge=0, description="The same for colours.")
     entropy_weight: float = Field(
         default=0.02, ge=0, description="Pushes rays towards opaque or empty."
     )

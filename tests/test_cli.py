@@ -15,7 +15,7 @@ def entry(config: RenderConfig, out: Path, frames: list[int], motion: str, seed:
 
 
 def test_flags_come_from_the_signature():
-    words = ["--config", json.dumps({"rigs": RIGS, "version": 1}), "--out", "x", "--motion", ""]
+    words = ["--config", json.dumps({"rigs": RIGS, "version": 2}), "--out", "x", "--motion", ""]
     values = cli.parse(entry, verb="render", words=[*words, "--frames", "3", "4"])
     assert values["config"].rigs["a"].ring_radius_m == 0.5
     assert values["out"] == Path("x")

@@ -19,7 +19,7 @@ from ntop.field.kernels.posing import nearest_vertices
 from ntop.field.kernels.tables import VOID_RAW, GridTables
 
 LEG_SPREAD_RAD = math.radians(20)
-OCCUPANCY_SPACING_M = 0.01
+OCCUPANCY_SPACING_M = 0.004
 LABEL_SPACING_M = 0.01
 LABEL_REACH_M = 0.06
 RAW_PER_M = 400.0  # initial density: raw rises by this per metre into the body
@@ -140,7 +140,15 @@ def distance_grid(
     nearest = np.empty((2, dims.prod()), np.int32)
     squared = np.empty((2, dims.prod()), np.float64)
     nearest_vertices(
-        relative, body.vertices, dims, spacing_m, reach_m + spacing_m, 1.0, 1, nearest, squared
+        relative,
+        np.zeros((1, 3, 4)),
+        dims,
+        spacing_m,
+        reach_m + spacing_m,
+        1.0,
+        1,
+        nearest,
+        squared,
     )
     nodes = np.flatnonzero(nearest[0] >= 0)
     found = np.empty(len(nodes))
@@ -213,20 +221,23 @@ def refined_grid(grid: CanonicalGrid, occupancy: Occupancy, *, voxel_m: float) -
     return CanonicalGrid(values, bricks, positions, grid.origin, voxel_m)
 
 
-def body_density(body: CanonicalGrid, grid: CanonicalGrid) -> Float[np.ndarray, " row"]:
-    """Raw density of the body's own grid at the nodes of another one.
+def body_density(
+    body: CanonicalGrid, grid: CanonicalGrid, *, sharpness: float
+) -> Float[np.ndarray, " row"]:
+    """Raw density of the body's own grid at the nodes of another one, `sharpness` times as steep.
 
     Where the body's shell has no brick, inside or out, nothing is known: the value is the one of
     the shell's border, far from both.
     """
     values = void_values(len(grid.positions))
     resample(body.tables(), grid.positions, grid.origin, grid.voxel_m, values)
-    return np.ascontiguousarray(np.clip(values[:, 0], *RAW_BOUNDS))
+    return np.ascontiguousarray(np.clip(sharpness * values[:, 0], *RAW_BOUNDS))
 
 
-def occupied_cells(grid: CanonicalGrid, *, raw_threshold: float, dilation: int) -> Occupancy:
-    """Cells in which the field's raw density may exceed a threshold, grown by whole cells."""
+def occupied_cells(grid: CanonicalGrid, *, raw_threshold: float, margin_m: float) -> Occupancy:
+    """Cells within `margin_m` of one in which the field's raw density may exceed a threshold."""
     spacing = OCCUPANCY_SPACING_M
+    dilation = math.ceil(margin_m / spacing)
     pad = (dilation + 1) * spacing
     origin = grid.origin - pad
     extent = grid.voxel_m * (4 * np.array(grid.bricks.shape) - 1)

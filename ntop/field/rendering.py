@@ -4,19 +4,20 @@ Only pixels that the projection of an occupied cell touches are marched; edges g
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose
-from ntop.conventions import PIXEL_CENTRE
+from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE
 from ntop.field.avatar import Avatar
 from ntop.field.canonical import (
     CanonicalGrid,
+    Occupancy,
     PartLabels,
     canonical_body,
     label_grid,
@@ -24,10 +25,10 @@ from ntop.field.canonical import (
 )
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
-from ntop.field.warp import PoseWarp, occupied, pose_warp
+from ntop.field.warp import PoseWarp, occupied, octant_radius_m, pose_warp
 from ntop.geometry.cameras import Camera, Equidistant
 
-CELL_M = 0.02
+CELL_M = 0.012  # of the warp grid; a coarser one bends wrongly at joints (0.02: -0.6 dB)
 # four rays of a pixel on a rotated grid: distinct rows and columns, unbiased about the centre
 EDGE_OFFSETS_PX = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 EDGE_ALPHA = (0.02, 0.98)
@@ -61,9 +62,9 @@ class RenderSettings:
 class Rendering:
     """One view. `rgb` is straight (not premultiplied) and meaningful where alpha > 0.
 
-    `depth_m` is the ray length at which half of the light is gone, 0 where nothing is; `parts`
-    holds label + 1. `window` (left, top, width, height) holds every pixel with alpha > 0; all is
-    zero outside. `evaluations` counts density look-ups.
+    `depth_m` is the ray length at which half of the light is gone, `parts` holds label + 1; both
+    are 0 outside the mask (alpha below one half). `window` (left, top, width, height) holds every
+    pixel with alpha > 0; all is zero outside. `evaluations` counts density look-ups.
     """
 
     rgb: Float[np.ndarray, "height width 3"]
@@ -107,27 +108,29 @@ def pose_avatar(
     settings = settings or RenderSettings()
     body = canonical_body(model, avatar.betas)
     warp = pose_warp(body, model, pose, cell_m=cell_m, reach_m=avatar.reach_m)
-    shared = _shared(avatar, model, settings.raw_threshold)
+    occupancy, labels = _shared(avatar, model, settings.raw_threshold, octant_radius_m(cell_m))
     return PosedAvatar(
         grid=avatar.grid,
-        warp=occupied(warp, shared[0]),
+        warp=replace(warp, tables=occupied(warp.tables, occupancy)),
         light=avatar.light.astype(np.float32),
-        labels=shared[1],
+        labels=labels,
     )
 
 
 _SHARED: dict[tuple, tuple] = {}
 
 
-def _shared(avatar: Avatar, model: BodyModel, raw_threshold: float) -> tuple:
+def _shared(
+    avatar: Avatar, model: BodyModel, raw_threshold: float, margin_m: float
+) -> tuple[Occupancy, PartLabels]:
     """Occupancy and labels of an avatar, the same in every pose; kept for the last one."""
-    key = (id(avatar), id(model), raw_threshold)
+    key = (id(avatar), id(model), raw_threshold, margin_m)
     if key not in _SHARED:
         _SHARED.clear()
-        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, dilation=1)
+        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, margin_m=margin_m)
         labels = label_grid(canonical_body(model, avatar.betas))
         _SHARED[key] = (occupancy, labels, avatar, model)  # held, so that no id is used twice
-    return _SHARED[key]
+    return _SHARED[key][:2]
 
 
 def trace_rays(
@@ -185,12 +188,15 @@ def render_view(
         more = _trace_pixels(posed, camera, shifted.reshape(-1, 2), settings=settings)
         straight[v[edges], u[edges]] = more.rgb.reshape(-1, 4, 3).mean(1)
         box_alpha[v[edges], u[edges]] = more.alpha.reshape(-1, 4).mean(1)
+        chosen = np.arange(len(shifted)) * 4 + _middle(more)
+        depth[v[edges] + top, u[edges] + left] = more.depth_m[chosen]
+        parts[v[edges] + top, u[edges] + left] = more.parts[chosen]
         evaluations += more.evaluations
-    # a pixel whose centre missed but whose corners hit has no depth of its own: leave 0
     straight /= np.maximum(box_alpha, 1e-6)[..., None]
     rgb[inner] = np.clip(straight, 0, 1)
     alpha[inner] = box_alpha
-    depth[alpha == 0], parts[alpha == 0] = 0, 0
+    empty = np.rint(255 * alpha) < MASK_ALPHA
+    depth[empty], parts[empty] = 0, 0
     return Rendering(rgb, alpha, depth, parts, window, evaluations)
 
 
@@ -235,6 +241,14 @@ def _trace_pixels(
     for values in (found.rgb, found.alpha, found.depth_m, found.parts):
         values[outside] = 0
     return found
+
+
+def _middle(rays: RayRendering) -> Int[np.ndarray, " pixel"]:
+    """Which of a pixel's four rays speaks for it: the nearer median of those that meet the body."""
+    depths = np.where(rays.alpha >= 0.5, rays.depth_m, np.inf).reshape(-1, 4)
+    order = np.argsort(depths, axis=1, kind="stable")
+    middle = (np.maximum(np.isfinite(depths).sum(1), 1) - 1) // 2
+    return np.take_along_axis(order, middle[:, None], 1)[:, 0]
 
 
 def _window(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:

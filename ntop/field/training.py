@@ -27,22 +27,25 @@ from ntop.field.kernels.learn import adam_step, gather
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tables import WarpTables
 from ntop.field.views import RayBatch, RaySource, TrainingViews
-from ntop.field.warp import PoseWarp, joined, occupied, pose_warp
+from ntop.field.warp import joined, occupied, octant_radius_m, pose_warp
 
 WATCHED_RAYS = 16384
 BETAS = (0.9, 0.99)
 VALUE_BOUNDS = ((-12.0, -8.0, -8.0, -8.0), (30.0, 8.0, 8.0, 8.0))
+PRIOR_RAYS = 8192  # rays per step for which the priors' weights are stated; losses are sums
 TINY_MSE = 1e-10
 BODY_VOXEL_M = 0.008  # of the body's own density, which others are anchored to
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How an avatar is trained. Lengths in metres; weights are per ray, or per node for priors.
+    """How an avatar is trained. Lengths in metres; weights are per ray, a prior's per node.
 
-    `voxels_m` and `level_starts` (share of all steps) are the coarse-to-fine schedule. A rate
-    falls exponentially from the first to the second value. `light`: learn light that depends on
-    the surface's direction in the world. `camera_colour`: learn a gain and bias per camera.
+    `voxels_m`, `level_starts` (share of all steps) and `sharpness` are the coarse-to-fine
+    schedule: in a level, raw density is `sharpness` times as steep as the body's was at first, and
+    the surface that much harder. A rate falls exponentially from the first to the second value.
+    `light`: learn light that depends on the surface's direction in the world. `camera_colour`:
+    learn a gain and bias per camera.
     """
 
     steps: int = 800
@@ -51,9 +54,10 @@ class TrainingSettings:
     seed: int = 0
     voxels_m: tuple[float, ...] = (0.016, 0.008, 0.005)
     level_starts: tuple[float, ...] = (0.0, 0.12, 0.4)
+    sharpness: tuple[float, ...] = (1.0, 4.0, 16.0)
     outer_m: float = 0.05
     inner_m: float = 0.03
-    cell_m: float = 0.02
+    cell_m: float = 0.012
     min_step_m: float = 0.003
     density_rate: tuple[float, float] = (0.3, 0.03)
     colour_rate: tuple[float, float] = (0.15, 0.015)
@@ -65,8 +69,8 @@ class TrainingSettings:
     band_px: int = 2
     shares: tuple[float, float] = (0.6, 0.25)
     entropy_weight: float = 0.02
-    density_smoothness: float = 5e-5
-    colour_smoothness: float = 2e-5
+    density_smoothness: float = 3e-5
+    colour_smoothness: float = 2e-4
     smooth_all_every: int = 25
     body_weight: float = 0.0
     occupancy_every: int = 100
@@ -104,19 +108,12 @@ def train(
     saved and `TrainingStoppedError` is raised.
     """
     body = canonical_body(model, betas)
-    warps = [
-        pose_warp(
-            body, model, single_pose(views.poses, p), cell_m=settings.cell_m,
-            reach_m=settings.outer_m,
-        )
-        for p in range(len(views.poses.transl))
-    ]  # fmt: skip
-    origins = np.stack([warp.origin_world for warp in warps])
+    tables, origins = _warps(views.poses, body, model, settings)
     source = _ray_source(views, ~views.watched, origins, settings)
     watched = _watched_rays(views, origins, settings)
     state = checkpoint_path and load_checkpoint(checkpoint_path, settings, Progress)
     state = state or initial_state(body, len(views.cameras), settings)
-    trainer = _Trainer(state, warps, settings, body)
+    trainer = _Trainer(state, tables, settings, body)
     while trainer.state.step < settings.steps and not _stalled(trainer.state.curve, settings):
         trainer.step(source, watched)
         state = trainer.state
@@ -134,6 +131,20 @@ def train(
 
 class TrainingStoppedError(Exception):
     """Training was asked to stop and has saved its state."""
+
+
+def _warps(
+    poses: BodyPose, body: CanonicalBody, model: BodyModel, settings: TrainingSettings
+) -> tuple[WarpTables, np.ndarray]:
+    """The warps of all poses in one, and the world origin (metres) of each."""
+    tables, origins = [], []
+    for p in range(len(poses.transl)):
+        warp = pose_warp(
+            body, model, single_pose(poses, p), cell_m=settings.cell_m, reach_m=settings.outer_m
+        )
+        tables.append(warp.tables)
+        origins.append(warp.origin_world)
+    return joined(tables), np.stack(origins)
 
 
 def single_pose(poses: BodyPose, index: int) -> BodyPose:
@@ -169,7 +180,7 @@ class _Trainer:
     def __init__(
         self,
         state: TrainingState,
-        warps: list[PoseWarp],
+        tables: WarpTables,
         settings: TrainingSettings,
         body: CanonicalBody,
     ) -> None:
@@ -177,16 +188,16 @@ class _Trainer:
         self._body_grid = initial_grid(
             body, voxel_m=BODY_VOXEL_M, outer_m=settings.outer_m, inner_m=settings.inner_m
         )
-        self._warps = warps
         self._settings = settings
-        self._tables = joined([occupied(warp, state.occupancy) for warp in warps])
+        self._tables = occupied(tables, state.occupancy)
         self._allocate()
 
     def _allocate(self) -> None:
         rows, slots = len(self.state.grid.values), len(self.state.grid.positions)
         blocks = self._settings.ray_blocks
         self._gradients = np.zeros((blocks, rows, 4), np.float32)
-        self._anchors = body_density(self._body_grid, self.state.grid)
+        sharpness = self._settings.sharpness[self.state.level]
+        self._anchors = body_density(self._body_grid, self.state.grid, sharpness=sharpness)
         self._touched = np.zeros((blocks, slots), np.uint8)
 
     def step(self, source: RaySource, watched: RayBatch | None) -> None:
@@ -235,11 +246,12 @@ class _Trainer:
         share = state.step / settings.steps
         colour = _decayed(settings.colour_rate, share)
         rates = np.array([_decayed(settings.density_rate, share), colour, colour, colour])
+        prior = settings.rays_per_batch / PRIOR_RAYS
         smooth = np.array([settings.density_smoothness, *[settings.colour_smoothness] * 3])
         gather(
             state.grid.values, state.grid.bricks, state.grid.positions, active, self._gradients,
-            self._touched, smooth, np.array([0.5, 0.1, 0.1, 0.1]), self._anchors,
-            settings.body_weight,
+            self._touched, prior * smooth, np.array([0.5, 0.1, 0.1, 0.1]), self._anchors,
+            prior * settings.body_weight,
         )  # fmt: skip
         low, high = (np.array(bound) for bound in VALUE_BOUNDS)
         adam_step(
@@ -270,10 +282,13 @@ class _Trainer:
             occupancy = _occupancy(state.grid, settings)
             if finer:
                 grid = refined_grid(state.grid, occupancy, voxel_m=settings.voxels_m[level])
+                steeper = settings.sharpness[level] / settings.sharpness[state.level]
+                low, high = VALUE_BOUNDS[0][0], VALUE_BOUNDS[1][0]
+                grid.values[:, 0] = np.clip(steeper * grid.values[:, 0], low, high)
                 self.state = state.with_grid(grid, level=level)
                 self._allocate()
             self.state = replace(self.state, occupancy=occupancy)
-            self._tables = joined([occupied(warp, occupancy) for warp in self._warps])
+            self._tables = occupied(self._tables, occupancy)
 
 
 def level_at(step: int, settings: TrainingSettings) -> int:
@@ -335,7 +350,8 @@ def _stalled(curve: list[Progress], settings: TrainingSettings) -> bool:
 
 
 def _occupancy(grid, settings: TrainingSettings):
-    return occupied_cells(grid, raw_threshold=settings.occupied_raw, dilation=1)
+    margin_m = octant_radius_m(settings.cell_m)
+    return occupied_cells(grid, raw_threshold=settings.occupied_raw, margin_m=margin_m)
 
 
 def _march_step(state: TrainingState, settings: TrainingSettings) -> float:

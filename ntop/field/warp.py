@@ -5,7 +5,8 @@ transform back. This is exact on the surface and continuous off it until another
 is nearer; there a cell keeps two *sheets*, one per part, and the renderer takes the denser.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -22,9 +23,10 @@ from ntop.field.kernels.posing import (
 )
 from ntop.field.kernels.tables import WarpTables
 
-APART_M = 0.15  # canonical distance between what counts as different parts of the body
+APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
+STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ def pose_warp(
     nearest = np.empty((2, count), np.int32)
     distance = np.empty((2, count), np.float32)
     nearest_vertices(
-        vertices.astype(np.float32), body.vertices.astype(np.float32), dims, cell_m, radius,
-        APART_M, 2, nearest, distance,
+        vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m, radius, APART_M,
+        2, nearest, distance,
     )  # fmt: skip
     candidates, nodes = np.nonzero(nearest >= 0)
     records = np.empty((len(nodes), 6), np.float32)
@@ -78,7 +80,7 @@ def pose_warp(
     extra = np.empty((len(base), EXTRA_PER_CELL, 6), np.float32)
     cell_sheets(
         base, dims, cell_m, nearest, distance, record_of, records, maps, normals, reach_m,
-        AGREE_M, sheets, extra_count, extra,
+        APART_M, AGREE_M, sheets, extra_count, extra,
     )  # fmt: skip
     first_extra = len(records) + np.concatenate([[0], np.cumsum(extra_count)[:-1]])
     extras = extra[np.arange(EXTRA_PER_CELL) < extra_count[:, None]]
@@ -97,17 +99,22 @@ def pose_warp(
     return PoseWarp(tables, origin, cell_m)
 
 
-def occupied(warp: PoseWarp, occupancy: Occupancy) -> PoseWarp:
-    """The same warp that skips what the canonical occupancy rules out."""
-    tables = warp.tables
+def occupied(tables: WarpTables, occupancy: Occupancy) -> WarpTables:
+    """The same warps, of one or several poses, that skip what the canonical occupancy rules out."""
     found = np.empty_like(tables.occupancy)
     octant_occupancy(tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, found)
-    return replace(warp, tables=tables._replace(occupancy=found, blocks=_blocks(tables, found)))
+    poses = range(len(tables.dims))
+    blocks = np.concatenate([_blocks(tables, found, p) for p in poses])
+    return tables._replace(occupancy=found, blocks=blocks)
 
 
-def joined(warps: list[PoseWarp]) -> WarpTables:
-    """One table of all poses, for training; pose p is `warps[p]`."""
-    tables = [warp.tables for warp in warps]
+def octant_radius_m(cell_m: float) -> float:
+    """How far a point of an octant, as the occupancy looks them up, may lie from its centre."""
+    return STRETCH * cell_m * math.sqrt(3) / 4
+
+
+def joined(tables: list[WarpTables]) -> WarpTables:
+    """One table of all poses, for training; pose p is `tables[p]`."""
     cell_start = np.cumsum([0] + [len(t.sheets) for t in tables])
     node_start = np.cumsum([0] + [len(t.nodes) for t in tables])
     return WarpTables(
@@ -198,9 +205,9 @@ def _cells_near(squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: flo
     )
 
 
-def _blocks(tables: WarpTables, occupancy: np.ndarray) -> np.ndarray:
-    dims = tables.dims[0]
-    cells = tables.cells.reshape(dims)
+def _blocks(tables: WarpTables, occupancy: np.ndarray, pose: int) -> np.ndarray:
+    dims = tables.dims[pose]
+    cells = tables.cells[tables.cell_offset[pose] :][: dims.prod()].reshape(dims)
     full = np.zeros(4 * ((dims + 3) // 4), bool)
     full[: dims[0], : dims[1], : dims[2]] = (cells >= 0) & (occupancy[cells] != 0)
     bx, by, bz = (n // 4 for n in full.shape)

@@ -18,6 +18,8 @@ from ntop.geometry.cameras import Camera
 
 MAX_CONDITION = 1e6  # of the 3 x 3 normal matrix; beyond, a point slides along its rays
 REWEIGHTINGS = 5  # of the 1 / distance^2 weights; converges to 1e-6 m in 2-3 for real rigs
+CAUCHY_SHARE = 0.1  # of the tolerance: the angle at which a ray counts half (a detector's noise)
+CAUCHY_STEPS = 15  # of the reweighting; moves real points by less than 0.1 mm afterwards
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,8 @@ def triangulate_robust(
     Every pair of cameras proposes a point; the one with the smallest truncated squared angle over
     all cameras (MSAC: Torr & Zisserman 2000) decides who belongs. Exhaustive, hence deterministic:
     a capture has a handful of cameras. With two cameras nothing can be dropped, only refused.
+    Those who belong are weighted by how well they agree (Cauchy's loss): a detector errs in one
+    view more than in the others, and a mean would follow it.
 
     Raises:
         DataError: a number is not finite or a weight is negative.
@@ -98,7 +102,11 @@ def triangulate_robust(
         better = both & fixed & (agrees.sum(-1) >= 2) & (cost < best_cost)
         best_cost = torch.where(better, cost, best_cost)
         best = torch.where(better[..., None], agrees, best)
-    return triangulate(centers, directions, weights * best)
+    found = triangulate(centers, directions, weights * best)
+    for _ in range(CAUCHY_STEPS):
+        share = (found.angle_rad / (CAUCHY_SHARE * tolerance_rad)).square()
+        found = triangulate(centers, directions, weights * best / (1 + share))
+    return found
 
 
 def camera_rays(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, occupied_cells
 from ntop.field.kernels.tables import VOID_RAW
 from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
-from ntop.field.warp import identity_warp, occupied
+from ntop.field.warp import identity_warp, occupied, octant_radius_m
 from ntop.geometry.cameras import Camera, Equidistant
 from ntop.report.inputs import Dataset
 from ntop.storage.keys import SetKey
@@ -77,11 +77,14 @@ def ball(center_world: Float[np.ndarray, " 3"]) -> PosedAvatar:
     values[64:, 0] = np.clip(RAW_PER_M * depth, *RAW_LIMITS)
     grid = CanonicalGrid(values, bricks, positions, np.zeros(3), VOXEL_M)
     warp = identity_warp(low, center_world + reach, cell_m=CELL_M)
-    occupancy = occupied_cells(grid, raw_threshold=SETTINGS.raw_threshold, dilation=1)
+    occupancy = occupied_cells(
+        grid, raw_threshold=SETTINGS.raw_threshold, margin_m=octant_radius_m(CELL_M)
+    )
+    warp = replace(warp, tables=occupied(warp.tables, occupancy))
     light = np.zeros((9, 3), np.float32)
     light[0] = 1
     labels = PartLabels(np.ones((1, 1, 1), np.uint8), np.zeros(3), 1.0)
-    return PosedAvatar(grid=grid, warp=occupied(warp, occupancy), light=light, labels=labels)
+    return PosedAvatar(grid=grid, warp=warp, light=light, labels=labels)
 
 
 def ball_centroid_px(

@@ -7,9 +7,9 @@ stage and what follows from it, and the command line refuses a mismatch.
 STAGES = (
     (1, "capture", 1),
     (2, "mask", 1),
-    (3, "fit", 1),
-    (4, "train", 1),
-    (5, "render", 1),
+    (3, "fit", 2),
+    (4, "train", 2),
+    (5, "render", 2),
     (6, "annotate", 1),
     (7, "assemble", 1),
     (8, "evaluate", 1),

@@ -9,6 +9,7 @@
 A stopped training continues at its last checkpoint in the work folder, with the same result.
 """
 
+import math
 import sys
 import time
 from dataclasses import asdict
@@ -98,7 +99,9 @@ def training_settings(config: TrainConfig) -> TrainingSettings:
         rays_per_batch=config.rays_per_batch,
         seed=config.seed,
         voxels_m=(0.016, 0.008, config.finest_voxel_mm / 1000),
+        sharpness=(1.0, math.sqrt(config.sharpness), config.sharpness),
         outer_m=config.reach_m,
+        cell_m=config.warp_cell_mm / 1000,
         density_smoothness=config.density_smoothness,
         colour_smoothness=config.colour_smoothness,
         entropy_weight=config.entropy_weight,

@@ -114,16 +114,18 @@ def test_between_arm_and_trunk_both_ways_back_are_kept(model, body):
 def test_nearest_vertices_equal_brute_force():
     generator = np.random.default_rng(3)
     posed = generator.uniform(0.05, 0.35, (200, 3)).astype(np.float32)
-    canonical = generator.uniform(0, 0.4, (200, 3)).astype(np.float32)
+    maps = generator.uniform(-0.5, 0.5, (200, 3, 4)).astype(np.float32)
     dims, cell, radius, apart = np.array([21, 22, 23]), 0.02, 0.06, 0.15
     nearest = np.empty((2, dims.prod()), np.int32)
     distance = np.empty((2, dims.prod()), np.float32)
-    nearest_vertices(posed, canonical, dims, cell, radius, apart, 2, nearest, distance)
+    nearest_vertices(posed, maps, dims, cell, radius, apart, 2, nearest, distance)
     nodes = np.stack(np.unravel_index(np.arange(dims.prod()), dims), 1) * cell
     squared = ((nodes[:, None] - posed) ** 2).sum(-1)
     first = np.where(squared.min(1) < radius**2, squared.argmin(1), -1)
     np.testing.assert_array_equal(nearest[0], first)
-    far = ((canonical[first][:, None] - canonical) ** 2).sum(-1) >= apart**2
+    places = np.einsum("vij,nj->nvi", maps[:, :, :3].astype(float), nodes) + maps[:, :, 3]
+    own = places[np.arange(len(nodes)), first]
+    far = ((own[:, None] - places) ** 2).sum(-1) >= apart**2
     other = np.where(far & (first >= 0)[:, None], squared, np.inf)
     second = np.where(other.min(1) < radius**2, other.argmin(1), -1)
     np.testing.assert_array_equal(nearest[1], second)
@@ -133,7 +135,7 @@ def test_joined_tables_hold_each_pose_unchanged(model, body):
     warps = [
         pose_warp(body, model, pose_of(POSES[name]), cell_m=0.04, reach_m=0.03) for name in POSES
     ]
-    tables = joined(warps)
+    tables = joined([warp.tables for warp in warps])
     for p, warp in enumerate(warps):
         cells = tables.cells[tables.cell_offset[p] :][: len(warp.tables.cells)]
         filled = warp.tables.cells >= 0

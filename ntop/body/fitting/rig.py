@@ -16,7 +16,7 @@ from ntop.geometry.refinement import Observations, observe, resect
 # Refinement is scored on every fourth instant, counted from the third; cameras use the others.
 FOLD, SCORED = 4, 2
 SAME_PLACE_M = 1e-6
-SPREAD_TOLERANCE_PX = 25.0  # a camera that misses a limb point by more does not count
+SPREAD_TOLERANCE_PX = 40.0  # a camera that misses a limb point by more mixes limbs up
 
 
 def refine_recordings(

@@ -11,7 +11,8 @@ import numpy as np
 from ntop.field.kernels import device, kernel
 from ntop.field.kernels.tables import canonical_point
 
-MIN_VOLUME = 0.05  # a blended bone transform that shrinks volume below this has no usable inverse
+MAX_STRETCH = 6.0  # of an inverse's squared Frobenius norm; 3 is rigid, beyond it is no use
+TINY_VOLUME = 1e-6
 SLAB = 4  # nodes along x that one task owns
 
 
@@ -19,7 +20,8 @@ SLAB = 4  # nodes along x that one task owns
 def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone, maps):
     """Per vertex the affine map posed -> canonical that sends the posed vertex to its own rest.
 
-    Where blending has collapsed (candy wrapper), the vertex's main bone stands in, rigidly.
+    Where blending has collapsed (candy wrapper, hard bends), the vertex's main bone stands in,
+    rigidly: off the surface, the inverse would send points far away.
 
     Args:
         blended: (V, 3, 4) this pose's blend, rest -> posed. canonical_from_rest: (V, 3, 4) blend.
@@ -32,8 +34,9 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
         c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
         c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
         det = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
-        if det > MIN_VOLUME:
-            inverse = np.empty((3, 3), np.float64)
+        inverse = np.empty((3, 3), np.float64)
+        stretch = np.inf
+        if det > TINY_VOLUME:
             inverse[0, 0], inverse[1, 0], inverse[2, 0] = c00 / det, c01 / det, c02 / det
             inverse[0, 1] = (a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]) / det
             inverse[1, 1] = (a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]) / det
@@ -41,6 +44,8 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
             inverse[0, 2] = (a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]) / det
             inverse[1, 2] = (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) / det
             inverse[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) / det
+            stretch = (inverse * inverse).sum()
+        if stretch < MAX_STRETCH:
             for i in range(3):
                 for j in range(3):
                     total = 0.0
@@ -59,14 +64,30 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
             maps[v, i, 3] = canonical[v, i] - moved
 
 
+@device
+def squared_gap(one, other, x, y, z):
+    """Squared distance of the places to which two affine maps (3, 4) send a point."""
+    gap = 0.0
+    for a in range(3):
+        gap += (
+            (one[a, 0] - other[a, 0]) * x
+            + (one[a, 1] - other[a, 1]) * y
+            + (one[a, 2] - other[a, 2]) * z
+            + (one[a, 3] - other[a, 3])
+        ) ** 2
+    return gap
+
+
 @kernel
-def nearest_vertices(posed, canonical, dims, cell, radius, apart, candidates, nearest, distance):
-    """For each node the nearest posed vertex, and the nearest of another part of the body.
+def nearest_vertices(posed, maps, dims, cell, radius, apart, candidates, nearest, distance):
+    """For each node the nearest posed vertex, and the nearest that leads elsewhere.
 
     Args:
-        posed: (V, 3) metres relative to node (0, 0, 0). canonical: (V, 3) metres.
+        posed: (V, 3) metres relative to node (0, 0, 0).
+        maps: (V, 3, 4) posed -> canonical, read for the second candidate only.
         dims: (3,) nodes. cell: node spacing (m). radius: search radius (m).
-        apart: canonical distance (m) from which a vertex counts as another part.
+        apart: distance (m) of the two canonical places of a node from which a vertex leads
+            elsewhere. Both sides of a wrist lead to the same place, an arm and a trunk do not.
         candidates: 1 or 2; with 1 the second is left empty.
         nearest: (2, nodes) int32 output, -1 where none. distance: (2, nodes) squared metres.
     """
@@ -100,11 +121,8 @@ def nearest_vertices(posed, canonical, dims, cell, radius, apart, candidates, ne
                             n = (i * ny + j) * nz + k
                             if d < distance[candidate, n]:
                                 if candidate == 1:
-                                    u = nearest[0, n]
-                                    gap = (
-                                        (canonical[v, 0] - canonical[u, 0]) ** 2
-                                        + (canonical[v, 1] - canonical[u, 1]) ** 2
-                                        + (canonical[v, 2] - canonical[u, 2]) ** 2
+                                    gap = squared_gap(
+                                        maps[v], maps[nearest[0, n]], i * cell, j * cell, k * cell
                                     )
                                     if gap < apart * apart:
                                         continue
@@ -210,8 +228,8 @@ def apply_map(m, x, y, z, out):
 
 @kernel
 def cell_sheets(
-    cell_ids, dims, cell, nearest, distance, record_of, records, maps, normals, reach, agree,
-    sheets, extra_count, extra,
+    cell_ids, dims, cell, nearest, distance, record_of, records, maps, normals, reach, apart,
+    agree, sheets, extra_count, extra,
 ):  # fmt: skip
     """One or two consistent sheets per cell, each with a canonical position at all 8 corners.
 
@@ -222,7 +240,9 @@ def cell_sheets(
 
     Args:
         cell_ids: (cells,) number of each cell's first node. record_of: (2, nodes) record or -1.
-        reach: surface distance (m) up to which a second sheet is kept. agree: tolerance (m).
+        reach: surface distance (m) up to which a second sheet is kept.
+        apart, agree: canonical distances (m) from which records are of two sheets, and up to which
+            they are of one.
         sheets: (cells, 2, 8): record number, or -2 - e for extra e of this cell (-1: no sheet).
         extra_count: (cells,). extra: (cells, 16, 6) output.
     """
@@ -252,7 +272,7 @@ def cell_sheets(
                         gap = 0.0
                         for a in range(3):
                             gap += (records[record, a] - predicted[a]) ** 2
-                        if gap < 4 * agree * agree:
+                        if gap < apart * apart:
                             continue
                     start, start_candidate, start_corner = (
                         distance[candidate, node],

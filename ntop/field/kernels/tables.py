@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from ntop.field.kernels import device
 
 VOID_RAW = -12.0
-DENSITY_SCALE = 100.0  # 1/m per unit of softplus(raw): raw 15 is opaque within a few millimetres
+DENSITY_SCALE = 400.0  # 1/m per unit of softplus(raw): raw 8 is opaque within a millimetre
 HUGE = 1e30
 
 

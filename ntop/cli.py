@@ -16,7 +16,7 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from ntop.config import explain
+from ntop.config.base import explain
 from ntop.conventions import ConfigError, NtopError
 from ntop.stages import STAGES
 

@@ -1,6 +1,6 @@
 """Write config/README.md, the table of all configuration keys, from the models themselves.
 
-Run it after changing `ntop/config.py`; a test fails while the page and the models differ.
+Run it after changing `ntop/config/`; a test fails while the page and the models differ.
 """
 
 import types
@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from ntop.config import Actor, Config, Sequence
+from ntop.config.tables import Actor, Sequence
+from ntop.config.whole import Config
 
 PAGE = Path(__file__).parents[1] / "config/README.md"
 
@@ -18,7 +19,7 @@ INTRODUCTION = """# Configuration
 
 `config/config.yaml` is the demo; `--configfile config/other.yaml` is merged over it. Facts of the
 experiment stand here; threads, memory and folders belong to `profiles/`. Unknown keys are errors.
-This page is written by `scripts/write_config_reference.py` from the models in `ntop/config.py`.
+This page is written by `scripts/write_config_reference.py` from the models in `ntop/config/`.
 
 A source may change any value of the sections `mask`, `fit`, `train` and `render` for itself below
 `sources.<name>.overrides`, for example `overrides: {mask: {method: background}}`.

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from ntop import cli
-from ntop.config import RenderConfig, TrainConfig
+from ntop.config.sections import RenderConfig, TrainConfig
 from ntop.conventions import ConfigError
 
 RIGS = {"a": {"height_above_pelvis_m": 1.0, "ring_radius_m": 0.5}}

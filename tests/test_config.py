@@ -5,14 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ntop.config import (
-    Actor,
-    Sequence,
-    check_tables,
-    read_config,
-    read_tsv,
-    stage_section,
-)
+from ntop.config.tables import Actor, Sequence, read_tsv
+from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -80,6 +74,17 @@ def test_a_source_hands_its_facts_to_its_stages_only():
     config = read_config(SHIPPED)
     assert stage_section(config, "train", source="balancing")["held_out_views"] == ["cam04"]
     assert "held_out_views" not in stage_section(config, "train", source="studio")
+
+
+def test_a_gender_without_a_model_file_is_an_error():
+    changed = copy.deepcopy(SHIPPED)
+    changed["sources"]["balancing"]["body_models"] = {"f": "models/SMPL_FEMALE.pkl"}
+    config = read_config(changed)
+    woman, man = (Actor(source="balancing", actor=g, split="train", gender=g) for g in "fm")
+    assert body_model_of(config, woman) == "models/SMPL_FEMALE.pkl"
+    with pytest.raises(ConfigError, match=r"no file for gender 'm'.*have \['f'\]"):
+        body_model_of(config, man)
+    assert body_model_of(config, Actor(source="studio", actor="a", split="val")) == ""
 
 
 def test_an_actor_in_two_splits_is_an_error():

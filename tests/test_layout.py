@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ntop.config import STAGE_SECTIONS, Config
+from ntop.config.sections import STAGE_SECTIONS
+from ntop.config.whole import Config
 from ntop.stages import STAGES
 
 ROOT = Path(__file__).parents[1]

@@ -46,13 +46,16 @@ def read_smpl_arrays(path: Path) -> SmplArrays:
     Raises:
         DataError: Unreadable file, missing array or wrong shape.
     """
-    match path.suffix:
-        case ".npz":
-            content = _read_npz(path)
-        case ".pkl":
-            content = _read_pickle(path)
-        case other:
-            raise DataError(f"{path}: body model files end in .pkl or .npz, got {other!r}")
+    try:
+        match path.suffix:
+            case ".npz":
+                content = _read_npz(path)
+            case ".pkl":
+                content = _read_pickle(path)
+            case other:
+                raise DataError(f"{path}: body model files end in .pkl or .npz, got {other!r}")
+    except OSError as error:
+        raise DataError(f"cannot read body model {path}: {error.strerror}; {_REMEDY}") from error
 
     template = _array(content, "v_template", path)
     vertices = template.shape[0]

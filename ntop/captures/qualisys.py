@@ -17,7 +17,8 @@ from pathlib import Path
 
 import torch
 
-from ntop.config import QualisysSource, Sequence
+from ntop.config.sources import QualisysSource
+from ntop.config.tables import Sequence
 from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.geometry.cameras import Camera, Pinhole
 from ntop.storage import schemas

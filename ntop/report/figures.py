@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ntop.config import STAGE_SECTIONS
+from ntop.config.sections import STAGE_SECTIONS
 from ntop.report.charts import human
 from ntop.storage.atomic import write_bytes
 

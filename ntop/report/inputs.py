@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ntop.config import STAGE_SECTIONS
+from ntop.config.sections import STAGE_SECTIONS
 from ntop.conventions import DataError
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey

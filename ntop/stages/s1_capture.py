@@ -6,7 +6,8 @@ from pathlib import Path
 from ntop.captures.checks import check_capture
 from ntop.captures.qualisys import capture_qualisys
 from ntop.captures.studio import capture_studio
-from ntop.config import CaptureConfig, QualisysSource, StudioSource
+from ntop.config.sections import CaptureConfig
+from ntop.config.sources import QualisysSource, StudioSource
 from ntop.conventions import DataError
 from ntop.stages import STAGES
 from ntop.storage.atomic import publish_folder

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from ntop.config import MaskConfig
+from ntop.config.sections import MaskConfig
 from ntop.conventions import DataError
 from ntop.masks.background import temporal_median
 from ntop.masks.consensus import GROUPS, naming

@@ -31,7 +31,7 @@ from ntop.body.fitting.solver import FitSettings
 from ntop.body.landmarks import landmarks_on
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.skinning import BodyPose
-from ntop.config import FitConfig
+from ntop.config.sections import FitConfig
 from ntop.conventions import DataError
 from ntop.geometry.calibration import RefinementSettings
 from ntop.stages import STAGES
@@ -67,7 +67,7 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
         "keypoints2d": keypoints,
     }
     recordings = read_recordings(**inputs)
-    model = load_body_model()
+    model = load_body_model(config.body_path)
     landmarks = landmarks_on(model, recordings[0].skeleton)
     scores: dict[str, Any] = {}
     refinement = RefinementSettings(config.prior_weight, config.loss_scale_px, config.outlier_px)

@@ -19,7 +19,7 @@ import torch
 
 from ntop.body.model import load_body_model
 from ntop.captures.training_views import Tables, training_views
-from ntop.config import TrainConfig
+from ntop.config.sections import TrainConfig
 from ntop.field.avatar import save_avatar
 from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
 from ntop.stages import STAGES
@@ -58,7 +58,7 @@ def main(
     inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
     values = config.model_dump(mode="json")
     settings = training_settings(config)
-    model = load_body_model()
+    model = load_body_model(config.body_path)
     recipe = {"config": values, "inputs": inputs, "code": code_sha256()}
     with work_folder(work, recipe=recipe) as content, termination_flag() as terminated:
         views = training_views(

@@ -19,7 +19,7 @@ from ntop.body.authored_motions import named_motion
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.motions import Motion, retarget
 from ntop.body.skinning import BodyPose
-from ntop.config import RenderConfig
+from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
 from ntop.field.rendering import Rendering, pose_avatar, render_view
@@ -84,7 +84,7 @@ def main(
     with work_folder(work, recipe=recipe) as content, termination_flag() as terminated:
         missing = [key for key in usable if not set_folder(content, key).exists()]
         if missing:
-            model = load_body_model()
+            model = load_body_model(config.body_path)
             poses = (
                 novel_poses(missing, rows, model, motion=named_motion(motion, packages / CLIPS))
                 if motion

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ntop.annotation.annotate import ViewImages, annotate_view
-from ntop.config import AnnotateConfig
+from ntop.config.sections import AnnotateConfig
 from ntop.conventions import MASK_ALPHA, DataError
 from ntop.storage import schemas
 from ntop.storage.images import read_depth, read_parts, read_rgba

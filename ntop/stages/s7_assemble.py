@@ -8,7 +8,8 @@ from itertools import groupby
 from pathlib import Path
 
 import ntop
-from ntop.config import Actor, AssembleConfig
+from ntop.config.sections import AssembleConfig
+from ntop.config.tables import Actor
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.metrics.statistics import Tally, statistics_rows, statistics_table
 from ntop.stages import STAGES

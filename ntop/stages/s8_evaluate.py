@@ -10,7 +10,7 @@ import numpy as np
 
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.skinning import BodyPose
-from ntop.config import EvaluateConfig
+from ntop.config.sections import EvaluateConfig
 from ntop.conventions import ConfigError, DataError
 from ntop.field.avatar import load_avatar
 from ntop.field.rendering import pose_avatar, render_view
@@ -81,8 +81,7 @@ def main(
     started = time.monotonic()
     actors = actor_folders(captures, mattes=mattes, bodies=bodies, avatars=avatars)
     assembled = Dataset.read(dataset)
-    model = load_body_model()
-    reports = {actor.name: report_actor(config, assembled, actor, model=model) for actor in actors}
+    reports = {actor.name: report_actor(config, assembled, actor) for actor in actors}
     values = mean_values([report.values for report in reports.values()])
     values |= dataset_values(assembled)
     values |= stage_costs(benchmarks)
@@ -94,10 +93,10 @@ def main(
         write_page(page, folder / "report.html")
 
 
-def report_actor(
-    config: EvaluateConfig, dataset: Dataset, actor: ActorFolders, *, model: BodyModel
-) -> ActorReport:
+def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) -> ActorReport:
     """Scores and pictures of one actor."""
+    file = config.body_models.get(actor.name)
+    model = load_body_model(Path(file) if file else None)
     recording = Recording(actor)
     held_out = set(config.held_out_views.get(actor.source, ()))
     render = avatar_renderer(actor, model)

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from ntop.config import QualisysSource, Sequence
+from ntop.config.sources import QualisysSource
+from ntop.config.tables import Sequence
 
 VIEWS = ("cam01", "cam02", "cam03", "cam04")
 WIDTH, HEIGHT = 68, 120  # the calibrated image at 1/16

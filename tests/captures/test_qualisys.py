@@ -16,7 +16,7 @@ from ntop.captures.qualisys import (
     normalised_view,
     read_qca,
 )
-from ntop.config import Sequence
+from ntop.config.tables import Sequence
 from ntop.conventions import DataError
 from ntop.storage import schemas
 from ntop.storage.cameras import read_cameras

@@ -27,7 +27,9 @@ from ntop.captures.studio.views import (
     studio_light,
 )
 from ntop.captures.studio.visibility import VISIBILITY, measure_limbs, true_visibility
-from ntop.config import CaptureConfig, Sequence, StudioSource
+from ntop.config.sections import CaptureConfig
+from ntop.config.sources import StudioSource
+from ntop.config.tables import Sequence
 from ntop.conventions import MASK_ALPHA, ConfigError
 from ntop.geometry.cameras import Camera, Pinhole
 from ntop.geometry.rigs import Rig, top_view_cameras

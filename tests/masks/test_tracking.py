@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ntop.config import MaskConfig
+from ntop.config.sections import MaskConfig
 from ntop.conventions import DataError
 from ntop.masks.landmarks import intersection_over_union
 from ntop.masks.network import Network

@@ -16,7 +16,8 @@ import torch
 from ntop.body.model import load_body_model, part_labels
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.captures.studio.raycast import RayMesh
-from ntop.config import Actor, AnnotateConfig, AssembleConfig
+from ntop.config.sections import AnnotateConfig, AssembleConfig
+from ntop.config.tables import Actor
 from ntop.field.avatar import Avatar, save_avatar
 from ntop.field.canonical import canonical_body, initial_grid
 from ntop.geometry.cameras import Camera, Pinhole, pixel_grid

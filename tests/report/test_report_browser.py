@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ntop.config import EvaluateConfig
+from ntop.config.sections import EvaluateConfig
 from ntop.stages import s8_evaluate
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")

@@ -12,7 +12,7 @@ from ntop.body.authored_motions import named_motion
 from ntop.body.model import load_body_model
 from ntop.body.motions import retarget
 from ntop.body.skinning import pose_joints
-from ntop.config import AnnotateConfig, AssembleConfig, RenderConfig
+from ntop.config.sections import AnnotateConfig, AssembleConfig, RenderConfig
 from ntop.field.avatar import Avatar, save_avatar
 from ntop.field.canonical import CanonicalGrid, canonical_body, initial_grid
 from ntop.stages import s5_render, s6_annotate, s7_assemble

@@ -7,7 +7,7 @@ import pytest
 import torch
 from pycocotools import mask as coco_mask
 
-from ntop.config import AnnotateConfig
+from ntop.config.sections import AnnotateConfig
 from ntop.conventions import MASK_ALPHA, DataError
 from ntop.stages import s6_annotate
 from ntop.storage import schemas

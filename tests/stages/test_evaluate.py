@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from ntop.config import EvaluateConfig
+from ntop.config.sections import EvaluateConfig
 from ntop.conventions import DataError
 from ntop.report.figures import ALWAYS
 from ntop.stages import s8_evaluate

@@ -7,7 +7,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from ntop.config import CaptureConfig, FitConfig, MaskConfig, Sequence, StudioSource
+from ntop.body.model import EMBEDDED_BODY_PATH
+from ntop.config.sections import CaptureConfig, FitConfig, MaskConfig
+from ntop.config.sources import StudioSource
+from ntop.config.tables import Sequence
 from ntop.conventions import DataError
 from ntop.metrics.images import mask_iou
 from ntop.stages import s1_capture, s2_mask, s3_fit
@@ -126,6 +129,28 @@ def test_the_true_body_is_recovered_from_noisy_keypoints(capture, tmp_path):
     assert np.median(errors) < 0.015  # m; 0.3 px of 160 px pictures are about 6 mm
     assert all(row["reason"] == "" for row in fitted)
     assert len({tuple(row["betas"]) for row in fitted}) == 1
+
+
+def test_a_model_file_replaces_the_embedded_body(capture, tmp_path):
+    with np.load(EMBEDDED_BODY_PATH) as arrays:
+        smaller = {name: arrays[name] for name in arrays.files}
+    smaller["v_template"] = (0.95 * smaller["v_template"]).astype(np.float32)
+    path = tmp_path / "SMPL_NEUTRAL.npz"
+    np.savez(path, **smaller)
+    fit(capture, tmp_path / "embedded")
+    fit(
+        capture, tmp_path / "file", config=FitConfig(refine_cameras=False, body_model=str(path))
+    )  # fmt: skip
+    first, second = (
+        read_table(tmp_path / name / "bodies.parquet", schema=schemas.BODY)[0]
+        for name in ("embedded", "file")
+    )
+    # the same person: the smaller template needs other betas for the same joints
+    assert np.abs(np.subtract(first["betas"], second["betas"])).max() > 0.2
+    gap = np.subtract(first["joints3d_world_m"], second["joints3d_world_m"]).reshape(24, 3)
+    assert np.median(np.linalg.norm(gap, axis=1)) < 0.03
+    with pytest.raises(DataError, match="nowhere"):
+        fit(capture, tmp_path / "x", config=FitConfig(body_model=str(tmp_path / "nowhere.npz")))
 
 
 def test_nan_keypoints_are_refused_with_their_place(capture, tmp_path):

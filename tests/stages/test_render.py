@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ntop.config import RenderConfig
+from ntop.config.sections import RenderConfig
 from ntop.conventions import MASK_ALPHA, VIEWS, ConfigError, DataError
 from ntop.stages import s5_render
 from ntop.storage import schemas

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from ntop.cli import main as ntop
-from ntop.config import CaptureConfig
+from ntop.config.sections import CaptureConfig
 from ntop.conventions import DataError
 from ntop.stages.s1_capture import main
 from ntop.storage import schemas

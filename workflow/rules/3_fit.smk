@@ -4,6 +4,7 @@ rule fit:
         capture=capture_folder,
         keypoints=keypoint_folder,
         mattes=matte_folder,
+        model=body_model,
     output:
         directory("results/3_fit/{source}/{actor}"),
     log:
@@ -16,7 +17,7 @@ rule fit:
     resources:
         mem_mb=4000,
     params:
-        config=stage_params("fit"),
+        config=body_stage_params("fit"),
     shell:
         "exec ntop fit --config {params.config:q} --capture {input.capture:q}"
         " --keypoints {input.keypoints:q}/keypoints2d.parquet"

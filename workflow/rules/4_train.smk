@@ -4,6 +4,7 @@ rule train:
         capture=capture_folder,
         mattes=matte_folder,
         bodies=body_folder,
+        model=body_model,
     output:
         directory("results/4_train/{source}/{actor}"),
     log:
@@ -17,7 +18,7 @@ rule train:
         mem_mb=6000,
         gpu=0,
     params:
-        config=stage_params("train"),
+        config=body_stage_params("train"),
         work="results/work/4_train/{source}/{actor}",
     shell:
         "NUMBA_NUM_THREADS={threads} exec ntop train --config {params.config:q} --capture {input.capture:q}"

@@ -4,6 +4,7 @@ rule render:
         avatar="results/4_train/{source}/{actor}",
         bodies=body_folder,
         packages=render_packages,
+        model=body_model,
     output:
         directory("results/5_render/{source}/{actor}/{action}/{rig}/{shard}"),
     log:
@@ -16,7 +17,7 @@ rule render:
         mem_mb=3000,
         gpu=0,
     params:
-        config=stage_params("render"),
+        config=body_stage_params("render"),
         packages=PACKAGES,
         motion=render_motion,
         frames=shard_frames,

@@ -3,14 +3,8 @@ import json
 import sys
 from pathlib import Path
 
-from ntop.config import (
-    Actor,
-    Sequence,
-    check_tables,
-    read_config,
-    read_tsv,
-    stage_section,
-)
+from ntop.config.tables import Actor, Sequence, read_tsv
+from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
 from ntop.stages import STAGES
 
@@ -25,7 +19,7 @@ except ConfigError as error:
 VERSIONS = {name: version for _, name, version in STAGES}
 PACKAGES = "data/packages"
 # what a source says to later stages must not rerun its capture
-NOT_FOR_CAPTURE = {"overrides", "reference_masks", "held_out_views"}
+NOT_FOR_CAPTURE = {"overrides", "reference_masks", "held_out_views", "body_models"}
 KEY = "{source}/{actor}"
 
 
@@ -48,6 +42,23 @@ def stage_params(stage):
 
     def section_of(wildcards):
         return params_json(stage, getattr(wildcards, "source", None))
+
+    return section_of
+
+
+def body_model(wildcards):
+    """The actor's SMPL file as a list of inputs, empty for the embedded body."""
+    key = (wildcards.source, wildcards.actor)
+    found = next(row for row in ACTORS if (row.source, row.actor) == key)
+    return [path for path in [body_model_of(CONFIG, found)] if path]
+
+
+def body_stage_params(stage):
+    """A params function for a stage that poses the actor's body."""
+
+    def section_of(wildcards):
+        extra = {"body_model": path for path in body_model(wildcards)}
+        return params_json(stage, wildcards.source, extra)
 
     return section_of
 
@@ -200,6 +211,8 @@ def evaluate_params(wildcards):
             if section.reference_masks
         },
     }
+    files = {f"{row.source}/{row.actor}": body_model_of(CONFIG, row) for row in ACTORS}
+    extra["body_models"] = {name: path for name, path in files.items() if path}
     return params_json("evaluate", None, extra)
 
 

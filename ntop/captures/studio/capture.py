@@ -15,7 +15,9 @@ from ntop.captures.studio.recording import disturbed, grown, misplaced, side_cam
 from ntop.captures.studio.room import empty_room
 from ntop.captures.studio.truth import TruePose, write_truth
 from ntop.captures.studio.views import light_actor, over, see, studio_light
-from ntop.config import CaptureConfig, Sequence, StudioSource
+from ntop.config.sections import CaptureConfig
+from ntop.config.sources import StudioSource
+from ntop.config.tables import Sequence
 from ntop.conventions import ConfigError
 from ntop.geometry.cameras import Camera
 from ntop.geometry.rigs import Rig

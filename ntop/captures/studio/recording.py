@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from ntop.body.skinning import BodyPose
-from ntop.config import StudioSource
+from ntop.config.sources import StudioSource
 from ntop.geometry.cameras import Camera, Pinhole
 from ntop.geometry.rotations import matrix_from_axis_angle
 

@@ -1,0 +1,1 @@
+"""What a run is about: frozen sections, unknown keys are errors, units in the names."""

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from ntop.config.base import explain
 from ntop.conventions import ConfigError, NtopError
-from ntop.stages import STAGES
+from ntop.stages import STAGES, VERSIONS
 
 TOOLS = ("fetch",)
 EXIT_USER_ERROR = 2
@@ -100,7 +100,7 @@ def read_section(text: str, *, kind: type[BaseModel], verb: str) -> BaseModel:
         values = json.loads(source)
     except json.JSONDecodeError as error:
         raise ConfigError(f"--config is not JSON: {error}") from error
-    version = next(version for _, name, version in STAGES if name == verb)
+    version = VERSIONS[verb]
     given = values.pop("version", version)
     if given != version:
         raise ConfigError(

@@ -14,3 +14,5 @@ STAGES = (
     (7, "assemble", 1),
     (8, "evaluate", 1),
 )
+
+VERSIONS = {name: version for _, name, version in STAGES}

@@ -9,7 +9,7 @@ from ntop.captures.studio import capture_studio
 from ntop.config.sections import CaptureConfig
 from ntop.config.sources import QualisysSource, StudioSource
 from ntop.conventions import DataError
-from ntop.stages import STAGES
+from ntop.stages import VERSIONS
 from ntop.storage.atomic import publish_folder
 from ntop.storage.provenance import file_sha256, provenance, write_provenance
 
@@ -50,7 +50,7 @@ def main(config: CaptureConfig, source: str, actor: str, packages: Path, out: Pa
         check_capture(work)
         record = provenance(
             stage=STAGE,
-            version=next(version for _, name, version in STAGES if name == STAGE),
+            version=VERSIONS[STAGE],
             config=config.model_dump(mode="json"),
             inputs=_inputs(config, packages=packages, work=work),
         )

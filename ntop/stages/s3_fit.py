@@ -34,7 +34,7 @@ from ntop.body.skinning import BodyPose
 from ntop.config.sections import FitConfig
 from ntop.conventions import DataError
 from ntop.geometry.calibration import RefinementSettings
-from ntop.stages import STAGES
+from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import publish_folder, write_bytes
 from ntop.storage.bodies import body_rows
@@ -204,7 +204,7 @@ def _publish(
         write_bytes(work / "scores.json", text.encode())
         record = provenance(
             stage=STAGE,
-            version=next(version for _, name, version in STAGES if name == STAGE),
+            version=VERSIONS[STAGE],
             config=config.model_dump(mode="json"),
             inputs={name: file_sha256(path) for name, path in inputs.items()},
         )

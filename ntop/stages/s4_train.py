@@ -22,7 +22,7 @@ from ntop.captures.training_views import Tables, training_views
 from ntop.config.sections import TrainConfig
 from ntop.field.avatar import save_avatar
 from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
-from ntop.stages import STAGES
+from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
@@ -86,8 +86,7 @@ def main(
             save_avatar(avatar, folder, write=write_bytes)
             rows = [{name: getattr(line, name) for name in schemas.CURVE.names} for line in curve]
             write_table(rows, schema=schemas.CURVE, path=folder / "curve.parquet")
-            version = next(version for _, name, version in STAGES if name == STAGE)
-            record = provenance(stage=STAGE, version=version, config=values, inputs=inputs)
+            record = provenance(stage=STAGE, version=VERSIONS[STAGE], config=values, inputs=inputs)
             write_provenance(record, folder=folder)
         clear_work(work)
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -24,17 +25,19 @@ from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
 from ntop.field.rendering import Rendering, pose_avatar, render_view
 from ntop.geometry.rigs import Rig, top_view_cameras
+from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.bodies import body_pose_from_rows, read_bodies
 from ntop.storage.images import write_depth, write_parts, write_rgba
 from ntop.storage.keys import SetKey
 from ntop.storage.links import link_or_copy
-from ntop.storage.provenance import code_sha256, file_sha256
+from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
 from ntop.storage.renders import IMAGE_FOLDERS, body_columns, image_paths, render_row
 from ntop.storage.tables import Row, read_table, write_table
 from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, work_folder
 
+STAGE = "render"
 CLIPS = "pybullet"  # the package that novel motions come from
 FRAME_RATE_HZ = 30.0  # of novel motions; recorded ones have the capture's frames
 RENDERS_NAME, SKIPPED_NAME = "renders.parquet", "skipped.json"
@@ -58,7 +61,7 @@ def main(
 
     `motion` is empty for the recorded poses of `action`, else the name of a motion that is
     retargeted to the actor's shape. `out` gets renders.parquet (schema RENDER), images/, depth/,
-    parts/ and skipped.json, the frames without a usable body and why.
+    parts/, provenance.json and skipped.json, the frames without a usable body and why.
 
     Raises:
         ConfigError: unknown rig or motion.
@@ -98,7 +101,11 @@ def main(
                 config=config,
             )
             render_sets(missing, poses, studio, content=content, terminated=terminated)
-        publish(usable, skipped, content=content, out=out)
+        inputs = {"avatar": avatar_sha256, "bodies": recipe["bodies"]}
+        record = provenance(
+            stage=STAGE, version=VERSIONS[STAGE], config=recipe["config"], inputs=inputs
+        )
+        publish(usable, skipped, record, content=content, out=out)
         clear_work(work)
 
 
@@ -241,7 +248,9 @@ def write_view(rendering: Rendering, paths: dict[str, Path]) -> str:
     return write_rgba(rendering.rgb, rendering.alpha, path=paths["image_path"])
 
 
-def publish(keys: list[SetKey], skipped: list[Row], *, content: Path, out: Path) -> None:
+def publish(
+    keys: list[SetKey], skipped: list[Row], record: dict[str, Any], *, content: Path, out: Path
+) -> None:
     """Make the shard's folder from its finished sets, by one rename."""
     rows = []
     with atomic_folder(out) as folder:
@@ -254,6 +263,7 @@ def publish(keys: list[SetKey], skipped: list[Row], *, content: Path, out: Path)
         write_table(rows, schema=schemas.RENDER, path=folder / RENDERS_NAME)
         text = json.dumps(skipped, indent=1, sort_keys=True) + "\n"
         write_bytes(folder / SKIPPED_NAME, text.encode())
+        write_provenance(record, folder=folder)
 
 
 def set_folder(content: Path, key: SetKey) -> Path:

@@ -12,7 +12,7 @@ from ntop.config.sections import AssembleConfig
 from ntop.config.tables import Actor
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.metrics.statistics import Tally, statistics_rows, statistics_table
-from ntop.stages import STAGES
+from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.card import dataset_card
@@ -195,7 +195,7 @@ def write_summary(
     summary = {
         "dataset": config.dataset,
         "ntop_version": ntop.__version__,
-        "stage_versions": {name: version for _, name, version in STAGES},
+        "stage_versions": VERSIONS,
         "config": values,
         "config_sha256": json_sha256(values),
         "code_sha256": code_sha256(),

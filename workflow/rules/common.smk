@@ -6,7 +6,7 @@ from pathlib import Path
 from ntop.config.tables import Actor, Sequence, read_tsv
 from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
-from ntop.stages import STAGES
+from ntop.stages import VERSIONS
 
 try:
     CONFIG = read_config(config)
@@ -16,7 +16,6 @@ try:
 except ConfigError as error:
     sys.exit(f"ntop: {error}")
 
-VERSIONS = {name: version for _, name, version in STAGES}
 PACKAGES = "data/packages"
 # what a source says to later stages must not rerun its capture
 NOT_FOR_CAPTURE = {"overrides", "reference_masks", "held_out_views", "body_models"}

@@ -1,8 +1,10 @@
-"""Write config/README.md, the table of all configuration keys, from the models themselves.
+"""Write the page and the JSON schema of all configuration keys from the models themselves.
 
-Run it after changing `ntop/config/`; a test fails while the page and the models differ.
+Run it after changing `ntop/config/`; a test fails while they differ from the models. Editors read
+the schema through the first line of the YAML files.
 """
 
+import json
 import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -13,7 +15,9 @@ from pydantic.fields import FieldInfo
 from ntop.config.tables import Actor, Sequence
 from ntop.config.whole import Config
 
-PAGE = Path(__file__).parents[1] / "config/README.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "config/README.md"
+SCHEMA = ROOT / "workflow/schemas/config.schema.json"
 
 INTRODUCTION = """# Configuration
 
@@ -32,6 +36,14 @@ def reference() -> str:
     parts.append(_tables(Sequence, "", "Columns of the sequences table (TSV, `-` = default)"))
     parts.append(_tables(Actor, "", "Columns of the actors table (TSV)"))
     return "\n".join(parts)
+
+
+def schema() -> str:
+    """The JSON schema; no key is required, as a configuration file may be merged over another."""
+    values = Config.model_json_schema()
+    for section in (values, *values["$defs"].values()):
+        section.pop("required", None)
+    return json.dumps(values, indent=1) + "\n"
 
 
 def _tables(model: type[BaseModel], prefix: str, title: str) -> str:
@@ -93,3 +105,5 @@ def _default(field: FieldInfo) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(reference())
+    SCHEMA.parent.mkdir(exist_ok=True)
+    SCHEMA.write_text(schema())

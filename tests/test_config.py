@@ -1,7 +1,9 @@
 import copy
 import importlib.util
+import json
 from pathlib import Path
 
+import jsonschema
 import pytest
 import yaml
 
@@ -118,7 +120,7 @@ def test_a_broken_table_names_file_line_and_column(tmp_path):
         read_tsv(tmp_path / "missing.tsv", Actor)
 
 
-def test_the_page_of_all_keys_is_in_step_with_the_models():
+def test_the_page_and_the_schema_of_all_keys_are_in_step_with_the_models():
     path = ROOT / "scripts/write_config_reference.py"
     spec = importlib.util.spec_from_file_location("write_config_reference", path)
     script = importlib.util.module_from_spec(spec)
@@ -126,3 +128,15 @@ def test_the_page_of_all_keys_is_in_step_with_the_models():
     assert (ROOT / "config/README.md").read_text() == script.reference(), (
         "run: python scripts/write_config_reference.py"
     )
+    assert script.SCHEMA.read_text() == script.schema(), "run the same script"
+
+
+@pytest.mark.parametrize("name", ["config", "test", "studio"])
+def test_editors_find_the_schema_and_the_shipped_files_follow_it(name):
+    path = ROOT / f"config/{name}.yaml"
+    first = path.read_text().splitlines()[0]
+    place = first.removeprefix("# yaml-language-server: $schema=")
+    schema = json.loads((path.parent / place).read_text())
+    jsonschema.validate(yaml.safe_load(path.read_text()), schema)
+    with pytest.raises(jsonschema.ValidationError, match="stepz"):
+        jsonschema.validate({"train": {"stepz": 1}}, schema)

@@ -1,7 +1,8 @@
 """`ntop <verb> ...`: every stage and tool, its flags derived from its `main` signature.
 
 A stage's `config` flag takes the JSON that the workflow logs, so a logged command line is a
-complete recipe. Its `version` must be the stage's own, or the run is refused.
+complete recipe. Its `version` must be the stage's own, or the run is refused. A parameter of one
+letter is a flag of one letter, a bool is a flag without value, and `*words` is what follows `--`.
 """
 
 import argparse
@@ -20,12 +21,15 @@ from ntop.config.base import explain
 from ntop.conventions import ConfigError, NtopError
 from ntop.stages import STAGES, VERSIONS
 
-TOOLS = ("fetch",)
+TOOLS = ("fetch", "lease")
 EXIT_USER_ERROR = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one verb; an error meant for people ends with its text and exit code 2."""
+    """Run one verb; an error meant for people ends with its text and exit code 2.
+
+    Otherwise the exit code is what the verb's `main` returns, 0 for None.
+    """
     words = sys.argv[1:] if arguments is None else arguments
     verbs = {name: f"ntop.stages.s{number}_{name}" for number, name, _ in STAGES}
     verbs |= {name: f"ntop.tools.{name}" for name in TOOLS}
@@ -38,33 +42,57 @@ def main(arguments: list[str] | None = None) -> int:
         return EXIT_USER_ERROR
     entry = importlib.import_module(verbs[verb]).main
     try:
-        entry(**parse(entry, verb=verb, words=rest))
+        values = parse(entry, verb=verb, words=rest)
+        following = values.pop(_following(entry), [])
+        return entry(*following, **values) or 0
     except NtopError as error:
         sys.stderr.write(f"ntop {verb}: {error}\n")
         return EXIT_USER_ERROR
-    return 0
 
 
-def parse(entry: Callable[..., None], *, verb: str, words: list[str]) -> dict[str, Any]:
+def parse(entry: Callable[..., int | None], *, verb: str, words: list[str]) -> dict[str, Any]:
     """Values for the parameters of `entry`, read from command line words."""
     parser = argparse.ArgumentParser(
         prog=f"ntop {verb}",
         description=inspect.getdoc(entry),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parameters = inspect.signature(entry).parameters
-    for name, parameter in parameters.items():
+    following = _following(entry)
+    rest: list[str] = []
+    if following:
+        # cut here: what argparse makes of `--` differs between Python versions
+        cut = words.index("--") if "--" in words else len(words)
+        words, rest = words[:cut], words[cut + 1 :]
+        parser.usage = f"ntop {verb} [flags] -- {following} ..."
+    for name, parameter in inspect.signature(entry).parameters.items():
+        if name == following:
+            continue
         kind, many = _kind(parameter.annotation)
+        flag = f"-{name}" if len(name) == 1 else f"--{name.replace('_', '-')}"
+        if kind is bool:
+            parser.add_argument(flag, action="store_true")
+            continue
         required = parameter.default is inspect.Parameter.empty
         parser.add_argument(
-            f"--{name.replace('_', '-')}",
+            flag,
             type=_reader(kind, verb=verb),
             nargs="*" if many else None,
             required=required,
             default=None if required else parameter.default,
             metavar=kind.__name__,
         )
-    return vars(parser.parse_args(words))
+    values = vars(parser.parse_args(words))
+    if following:
+        if not rest:
+            parser.error(f"expected `-- {following} ...` after the flags, got nothing to run")
+        values[following] = rest
+    return values
+
+
+def _following(entry: Callable[..., int | None]) -> str:
+    """The parameter that takes what follows `--`; empty if there is none."""
+    parameters = inspect.signature(entry).parameters.values()
+    return next((p.name for p in parameters if p.kind is inspect.Parameter.VAR_POSITIONAL), "")
 
 
 def _kind(annotation: Any) -> tuple[type, bool]:

@@ -24,6 +24,30 @@ def test_flags_come_from_the_signature():
     assert values["seed"] == 3
 
 
+def tool(*command: str, n: int, json: bool = False) -> int:
+    """Stand-in for a tool that runs a command."""
+    return n + len(command) + json
+
+
+def test_a_tool_may_take_a_command_a_letter_and_a_switch():
+    words = ["-n", "2", "--json", "--", "ls", "-n", "--", "x"]
+    values = cli.parse(tool, verb="tool", words=words)
+    assert values == {"n": 2, "json": True, "command": ["ls", "-n", "--", "x"]}
+    assert cli.parse(tool, verb="tool", words=["-n", "2", "--", "ls"])["json"] is False
+
+
+@pytest.mark.parametrize("words", [["-n", "2"], ["-n", "2", "--"], ["-n", "2", "ls"]])
+def test_a_tool_without_its_command_is_refused(words, capsys):
+    with pytest.raises(SystemExit):
+        cli.parse(tool, verb="tool", words=words)
+    assert "-- command" in capsys.readouterr().err
+
+
+def test_the_exit_code_is_what_the_verb_returns(monkeypatch):
+    monkeypatch.setattr("ntop.tools.lease.main", tool)
+    assert cli.main(["lease", "-n", "2", "--", "ls"]) == 3
+
+
 def test_a_config_file_serves_as_well(tmp_path):
     path = tmp_path / "train.json"
     path.write_text('{"steps": 7}')

@@ -1,1 +1,1 @@
-"""Verbs beside the eight stages: fetching data, checking, planning."""
+"""Verbs beside the eight stages: fetching data, leasing GPUs."""

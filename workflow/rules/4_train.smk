@@ -21,7 +21,8 @@ rule train:
         config=body_stage_params("train"),
         work="results/work/4_train/{source}/{actor}",
     shell:
-        "NUMBA_NUM_THREADS={threads} exec ntop train --config {params.config:q} --capture {input.capture:q}"
+        "NUMBA_NUM_THREADS={threads} exec ntop lease -n {resources.gpu} -- ntop train"
+        " --config {params.config:q} --capture {input.capture:q}"
         " --cameras {input.bodies:q}/cameras.parquet --masks {input.mattes:q}/masks.parquet"
         " --bodies {input.bodies:q}/bodies.parquet --work {params.work:q}"
         " --out {output:q} 2> {log:q}"

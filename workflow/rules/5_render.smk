@@ -23,7 +23,8 @@ rule render:
         frames=shard_frames,
         work="results/work/5_render/{source}/{actor}/{action}/{rig}/{shard}",
     shell:
-        "NUMBA_NUM_THREADS={threads} exec ntop render --config {params.config:q} --source {wildcards.source}"
+        "NUMBA_NUM_THREADS={threads} exec ntop lease -n {resources.gpu} -- ntop render"
+        " --config {params.config:q} --source {wildcards.source}"
         " --actor {wildcards.actor} --action {wildcards.action} --rig {wildcards.rig}"
         " --frames {params.frames} --motion={params.motion:q} --avatar {input.avatar:q}"
         " --bodies {input.bodies:q}/bodies.parquet --packages {params.packages:q}"

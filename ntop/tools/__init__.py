@@ -1,1 +1,1 @@
-"""Verbs beside the eight stages: fetching data, leasing GPUs."""
+"""Verbs beside the eight stages: fetching data, leasing GPUs, looking after a run."""

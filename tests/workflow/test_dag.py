@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ntop.config.plan import planned_jobs
+from ntop.tools.status import load
 from tests.workflow.project import ROOT, TEST_CONFIG
 
 
@@ -30,6 +32,16 @@ def test_what_a_source_brings_along_is_not_in_the_plan(project):
     assert "results/2_mask/raw/loose" in done.stdout
     assert "results/2_mask/studio/plain" not in done.stdout
     assert "results/3_fit/studio/plain" not in done.stdout
+
+
+@pytest.mark.parametrize("words", [[], TEST_CONFIG])
+def test_the_plan_that_status_reads_is_snakemakes(project, words):
+    done = project.snakemake("-n", *words)
+    assert done.returncode == 0, done.stderr
+    outputs = re.findall(r"^    output: (results/.*)$", done.stdout, re.MULTILINE)
+    paths = [project.folder / word for word in words[1:]]
+    plan = planned_jobs(*load(paths, directory=project.folder))
+    assert sorted(outputs) == sorted(job.output for job in plan)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ import json
 import sys
 from pathlib import Path
 
+from ntop.config.plan import cut_shards, planned_jobs
 from ntop.config.tables import Actor, Sequence, read_tsv
 from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
@@ -110,12 +111,6 @@ def motion_packages(rows):
     )
 
 
-def shards_of(row):
-    """First frames of the shards a render sequence is cut into."""
-    frames = list(row.frames)
-    return [frames[i] for i in range(0, len(frames), CONFIG.render.sets_per_shard)]
-
-
 def render_row(wildcards):
     """The render sequence that a shard belongs to."""
     return next(
@@ -127,9 +122,8 @@ def render_row(wildcards):
 
 def shard_frames(wildcards):
     """The frames (sets) of one shard."""
-    frames = list(render_row(wildcards).frames)
-    start = frames.index(int(wildcards.shard))
-    return frames[start : start + CONFIG.render.sets_per_shard]
+    shards = cut_shards(render_row(wildcards), CONFIG.render.sets_per_shard)
+    return next(frames for frames in shards if frames[0] == int(wildcards.shard))
 
 
 def capture_packages(wildcards):
@@ -222,10 +216,5 @@ def reference_mask_files(wildcards):
     ]
 
 
-SHARDS = [
-    f"{row.source}/{row.actor}/{row.action}/{rig}/{first:06d}"
-    for row in SEQUENCES
-    if row.use == "render"
-    for rig in CONFIG.render.rigs
-    for first in shards_of(row)
-]
+JOBS = planned_jobs(CONFIG, ACTORS, SEQUENCES)
+SHARDS = [job.key for job in JOBS if job.stage == "render"]

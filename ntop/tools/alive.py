@@ -1,0 +1,98 @@
+"""What is alive: processes of this machine, jobs of the cluster, marks of Snakemake. Only looks.
+
+Snakemake marks every output it works on with a file below `.snakemake/incomplete`: its name is the
+output in base64, its content holds the cluster's job id. A mark goes away when its job ends *and*
+the head process is there to notice.
+"""
+
+import base64
+import binascii
+import json
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+MARKS = ".snakemake/incomplete"
+QUEUED = frozenset({"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT"})
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An output that a Snakemake process worked on when it was last heard of."""
+
+    output: str
+    job_id: str | None  # of the cluster; None for a job on the head's own machine
+    since: float  # seconds since the epoch
+
+
+@dataclass(frozen=True)
+class Processes:
+    """What runs in one working directory, on this machine."""
+
+    heads: tuple[int, ...]  # process ids of Snakemake itself
+    jobs: dict[str, int]  # output -> process id of the stage that makes it
+
+
+def read_marks(directory: Path) -> list[Mark]:
+    """Snakemake's marks, by output; a file that is no mark is passed over."""
+    folder = directory / MARKS
+    marks = []
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        # names too long for a file are cut into folders, each with an @ before it
+        parts = path.relative_to(folder).parts
+        name = "".join(part.removeprefix("@") for part in parts)
+        try:
+            output = base64.b64decode(name, altchars=b"-_", validate=True).decode()
+            since, record = path.stat().st_mtime, json.loads(path.read_text())
+        except (binascii.Error, UnicodeDecodeError, json.JSONDecodeError, FileNotFoundError):
+            continue  # no base64, half written, or its job has just ended
+        job_id = record.get("external_jobid") if isinstance(record, dict) else None
+        marks.append(Mark(output, None if job_id is None else str(job_id), since))
+    return sorted(marks, key=lambda mark: mark.output)
+
+
+def is_locked(directory: Path) -> bool:
+    """Whether a Snakemake process holds the directory, or was killed while it did."""
+    return any((directory / ".snakemake/locks").glob("*.lock"))
+
+
+def processes_in(directory: Path) -> Processes:
+    """Snakemake and stages that run in `directory`, as far as this user may see them."""
+    heads, jobs = [], {}
+    place = str(directory.resolve())
+    for process in psutil.process_iter():
+        try:
+            words = process.cmdline()
+            if not words or process.cwd() != place:
+                continue
+        except (psutil.Error, OSError):
+            continue  # ended meanwhile, or another user's
+        if "--out" in words[:-1]:  # every stage names its output so, and only its output
+            jobs[words[words.index("--out") + 1]] = process.pid
+        # on a cluster's node Snakemake starts itself once more, for a single job
+        elif is_snakemake(words) and "--target-jobs" not in words:
+            heads.append(process.pid)
+    return Processes(tuple(sorted(heads)), jobs)
+
+
+def is_snakemake(words: list[str]) -> bool:
+    """Whether a command line is Snakemake's, as a script or as `python -m snakemake`."""
+    return any(Path(word).name == "snakemake" for word in words[:3])
+
+
+def slurm_states(job_ids: set[str]) -> dict[str, str] | None:
+    """Job id -> state of those jobs that SLURM still has; None if it cannot be asked here."""
+    if not job_ids:
+        return {}
+    if shutil.which("squeue") is None:
+        return None
+    words = ["squeue", "--noheader", "--array", "--format=%i|%T", f"--jobs={','.join(job_ids)}"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        # what squeue says of a single job that it has forgotten; of several it just lists the rest
+        return {} if "Invalid job id" in done.stderr else None
+    rows = (line.strip().split("|") for line in done.stdout.splitlines())
+    return {row[0]: row[1] for row in rows if len(row) == 2}

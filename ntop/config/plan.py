@@ -54,6 +54,23 @@ def cut_shards(row: Sequence, sets_per_shard: int) -> list[tuple[int, ...]]:
     return [frames[i : i + sets_per_shard] for i in range(0, len(frames), sets_per_shard)]
 
 
+def shard_frames(
+    sequences: ListLike[Sequence], *, rigs: ListLike[str], sets_per_shard: int
+) -> dict[str, tuple[int, ...]]:
+    """The shards `{source}/{actor}/{action}/{rig}/{first frame}` of the tables, and their sets.
+
+    A shard's name depends on its own sequence and the size only, so that it stays when actors are
+    added.
+    """
+    return {
+        f"{row.source}/{row.actor}/{row.action}/{rig}/{frames[0]:06d}": frames
+        for row in sequences
+        if row.use == "render"
+        for rig in rigs
+        for frames in cut_shards(row, sets_per_shard)
+    }
+
+
 def planned_jobs(
     config: Config, actors: ListLike[Actor], sequences: ListLike[Sequence]
 ) -> list[Job]:
@@ -68,14 +85,10 @@ def planned_jobs(
         if fits:
             jobs["fit"].append(Job("fit", key))
         jobs["train"].append(Job("train", key))
-    for row in sequences:
-        if row.use != "render":
-            continue
-        for rig in config.render.rigs:
-            for frames in cut_shards(row, config.render.sets_per_shard):
-                key = f"{row.source}/{row.actor}/{row.action}/{rig}/{frames[0]:06d}"
-                jobs["render"].append(Job("render", key, frames))
-                jobs["annotate"].append(Job("annotate", key, frames))
+    size = config.render.sets_per_shard
+    shards = shard_frames(sequences, rigs=list(config.render.rigs), sets_per_shard=size)
+    for stage in ("render", "annotate"):
+        jobs[stage] += [Job(stage, key, frames) for key, frames in shards.items()]
     jobs["assemble"].append(Job("assemble", config.dataset))
     jobs["evaluate"].append(Job("evaluate", config.dataset))
     return [job for name in STAGE_SECTIONS for job in jobs[name]]

@@ -156,10 +156,12 @@ class AnnotateConfig(Section):
 
 
 class AssembleConfig(Section):
-    """Section `assemble`, completed by the workflow with the actors and their splits."""
+    """Section `assemble`, completed by the workflow with the actors and how shards are cut."""
 
     dataset: str
     actors: tuple[Actor, ...]
+    rigs: tuple[str, ...]
+    sets_per_shard: int = Field(ge=1)
 
 
 class EvaluateConfig(Section):

@@ -8,8 +8,9 @@ from itertools import groupby
 from pathlib import Path
 
 import ntop
+from ntop.config.plan import shard_frames
 from ntop.config.sections import AssembleConfig
-from ntop.config.tables import Actor
+from ntop.config.tables import Actor, Sequence, read_tsv
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.metrics.statistics import Tally, statistics_rows, statistics_table
 from ntop.stages import VERSIONS
@@ -45,17 +46,24 @@ class Totals:
     num_sets: int = 0
 
 
-def main(config: AssembleConfig, renders: list[Path], annotations: list[Path], out: Path) -> None:
-    """Build the dataset of all shards; `renders` and `annotations` are parallel lists.
+def main(
+    config: AssembleConfig, sequences: Path, renders: Path, annotations: Path, out: Path
+) -> None:
+    """Build the dataset of all shards that the table `sequences` asks for.
+
+    `renders` and `annotations` are the folders below which the shards lie. Their names come from
+    the table: thousands of them would not fit on a command line.
 
     Raises:
         ConfigError: an actor is in two splits, or has none.
-        DataError: a shard and its annotations disagree, or the folder cannot be written.
+        DataError: a shard is missing, a shard and its annotations disagree, or the folder cannot be
+            written.
     """
     actors = actors_by_key(config)
-    if len(renders) != len(annotations):
-        raise DataError(f"{len(renders)} shards and {len(annotations)} tables of annotations")
-    shards = [Shard(*pair) for pair in zip(renders, annotations, strict=True)]
+    keys = shard_frames(
+        read_tsv(sequences, Sequence), rigs=config.rigs, sets_per_shard=config.sets_per_shard
+    )
+    shards = [Shard(renders / key, annotations / f"{key}.parquet") for key in keys]
     totals = Totals()
     with atomic_folder(out) as folder:
         with ExitStack() as stack:

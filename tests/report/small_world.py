@@ -213,7 +213,7 @@ def write_truth(folder: Path, key: tuple[str, str]) -> None:
 
 def build_world(root: Path) -> World:
     """Write everything below `root`."""
-    shards, labels, actors = [], [], []
+    actors = []
     for key in SPLITS:
         place = "/".join(key)
         capture = root / "1_capture" / place
@@ -224,8 +224,6 @@ def build_world(root: Path) -> World:
         write_renders(shard, key, error=0.1)
         annotations = root / "6_annotate" / place / "stand/h1.2_r1.0/000000.parquet"
         s6_annotate.main(AnnotateConfig(), shard, annotations)
-        shards.append(shard)
-        labels.append(annotations)
         avatar = root / "4_train" / place
         avatar.mkdir(parents=True)
         write_avatar(avatar)
@@ -241,7 +239,11 @@ def build_world(root: Path) -> World:
         for (source, actor), split in SPLITS.items()
     )
     dataset = root / "7_assemble" / "tiny"
-    s7_assemble.main(AssembleConfig(dataset="tiny", actors=declared), shards, labels, dataset)
+    config = AssembleConfig(dataset="tiny", actors=declared, rigs=("h1.2_r1.0",), sets_per_shard=1)
+    lines = [f"{source}\t{actor}\tstand\t0\t0\trender" for source, actor in SPLITS]
+    table = root / "sequences.tsv"
+    table.write_text("\n".join(["source\tactor\taction\tfirst\tlast\tuse", *lines]) + "\n")
+    s7_assemble.main(config, table, root / "5_render", root / "6_annotate", dataset)
     benchmarks = root / "benchmarks"
     for index, name in enumerate(("a", "b")):
         path = benchmarks / "4_train" / f"{name}.tsv"

@@ -103,13 +103,18 @@ def shop(tmp_path_factory) -> Shop:
     return Shop(folder, config)
 
 
+def shard_name(actor: str, first: int) -> str:
+    """Where a shard lies below the shop's folder."""
+    return f"5_render/{SOURCE}/{actor}/{ACTION}/{RIG}/{first:06d}"
+
+
 @pytest.fixture(scope="session")
 def shards(shop) -> dict[str, Path]:
     """Rendered shards by name: two of the first actor, one of the second."""
     return {
-        "first": shop.render("first", frames=(0, 1)),
-        "second": shop.render("second", frames=(UNUSABLE, 3)),
-        "other": shop.render("other", actor="bob", frames=(1,)),
+        "first": shop.render(shard_name(ACTOR, 0), frames=(0, 1)),
+        "second": shop.render(shard_name(ACTOR, UNUSABLE), frames=(UNUSABLE, 3)),
+        "other": shop.render(shard_name("bob", 1), actor="bob", frames=(1,)),
     }
 
 
@@ -118,30 +123,41 @@ def annotations(shards) -> dict[str, Path]:
     """The tables of annotations of the shards."""
     tables = {}
     for name, folder in shards.items():
-        tables[name] = folder.with_name(f"{name}_annotations.parquet")
+        tables[name] = Path(str(folder).replace("5_render", "6_annotate") + ".parquet")
+        tables[name].parent.mkdir(parents=True, exist_ok=True)
         s6_annotate.main(AnnotateConfig(), renders=folder, out=tables[name])
     return tables
 
 
 @pytest.fixture(scope="session")
-def assemble(shards, annotations) -> Callable[..., Path]:
+def assemble(shop, annotations, tmp_path_factory) -> Callable[..., Path]:
     """A function that assembles the shards; `splits` maps actors to splits."""
+    lines = [
+        f"{SOURCE}\t{ACTOR}\t{ACTION}\t0\t3\t1\trender",
+        f"{SOURCE}\tbob\t{ACTION}\t1\t1\t1\trender",
+    ]
+    tables = tmp_path_factory.mktemp("tables")
 
-    def run(out: Path, *, splits: tuple[tuple[str, str], ...]) -> Path:
+    def run(out: Path, *, splits: tuple[tuple[str, str], ...], reverse: bool = False) -> Path:
+        header = "source\tactor\taction\tfirst\tlast\tstep\tuse"
+        table = tables / "sequences.tsv"
+        table.write_text("\n".join([header, *(lines[::-1] if reverse else lines)]) + "\n")
         config = AssembleConfig.model_validate(
             {
                 "dataset": "tiny",
+                "rigs": [RIG],
+                "sets_per_shard": 2,
                 "actors": [
                     {"source": SOURCE, "actor": actor, "split": split, "gender": gender}
                     for (actor, split), gender in zip(splits, "fmn", strict=False)
                 ],
             }
         )
-        names = ("second", "other", "first")  # any order gives the same dataset
         s7_assemble.main(
             config,
-            renders=[shards[name] for name in names],
-            annotations=[annotations[name] for name in names],
+            sequences=table,
+            renders=shop.folder / "5_render",
+            annotations=annotations["first"].parents[4],  # above source/actor/action/rig
             out=out,
         )
         return out

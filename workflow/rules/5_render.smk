@@ -20,7 +20,7 @@ rule render:
         config=body_stage_params("render"),
         packages=PACKAGES,
         motion=render_motion,
-        frames=shard_frames,
+        frames=sets_of_shard,
         work="results/work/5_render/{source}/{actor}/{action}/{rig}/{shard}",
     shell:
         "NUMBA_NUM_THREADS={threads} exec ntop lease -n {resources.gpu} -- ntop render"

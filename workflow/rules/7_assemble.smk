@@ -3,6 +3,7 @@ rule assemble:
     input:
         renders=[f"results/5_render/{shard}" for shard in SHARDS],
         annotations=[f"results/6_annotate/{shard}.parquet" for shard in SHARDS],
+        sequences=CONFIG.sequences,
     output:
         directory("results/7_assemble/{dataset}"),
     log:
@@ -16,5 +17,6 @@ rule assemble:
     params:
         config=assemble_params,
     shell:
-        "exec ntop assemble --config {params.config:q} --renders {input.renders:q}"
-        " --annotations {input.annotations:q} --out {output:q} 2> {log:q}"
+        "exec ntop assemble --config {params.config:q} --sequences {input.sequences:q}"
+        " --renders results/5_render --annotations results/6_annotate"
+        " --out {output:q} 2> {log:q}"

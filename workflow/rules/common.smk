@@ -3,7 +3,7 @@ import json
 import sys
 from pathlib import Path
 
-from ntop.config.plan import cut_shards, planned_jobs
+from ntop.config.plan import shard_frames
 from ntop.config.tables import Actor, Sequence, read_tsv
 from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
@@ -120,10 +120,10 @@ def render_row(wildcards):
     )
 
 
-def shard_frames(wildcards):
+def sets_of_shard(wildcards):
     """The frames (sets) of one shard."""
-    shards = cut_shards(render_row(wildcards), CONFIG.render.sets_per_shard)
-    return next(frames for frames in shards if frames[0] == int(wildcards.shard))
+    key = "{0.source}/{0.actor}/{0.action}/{0.rig}/{0.shard}".format(wildcards)
+    return SHARDS[key]
 
 
 def capture_packages(wildcards):
@@ -174,10 +174,13 @@ def render_motion(wildcards):
 
 
 def assemble_params(wildcards):
-    actors = [row.model_dump(mode="json") for row in ACTORS]
-    return params_json(
-        "assemble", None, {"dataset": wildcards.dataset, "actors": actors}
-    )
+    extra = {
+        "dataset": wildcards.dataset,
+        "actors": [row.model_dump(mode="json") for row in ACTORS],
+        "rigs": list(CONFIG.render.rigs),
+        "sets_per_shard": CONFIG.render.sets_per_shard,
+    }
+    return params_json("assemble", None, extra)
 
 
 def actor_folders(folder_of):
@@ -216,5 +219,8 @@ def reference_mask_files(wildcards):
     ]
 
 
-JOBS = planned_jobs(CONFIG, ACTORS, SEQUENCES)
-SHARDS = [job.key for job in JOBS if job.stage == "render"]
+SHARDS = shard_frames(
+    SEQUENCES,
+    rigs=list(CONFIG.render.rigs),
+    sets_per_shard=CONFIG.render.sets_per_shard,
+)

@@ -80,7 +80,10 @@ def processes_in(directory: Path) -> Processes:
 
 def is_snakemake(words: list[str]) -> bool:
     """Whether a command line is Snakemake's, as a script or as `python -m snakemake`."""
-    return any(Path(word).name == "snakemake" for word in words[:3])
+    names = [Path(word).name for word in words[:4]]
+    return names[:1] == ["snakemake"] or (
+        names[:1] != [] and names[0].startswith("python") and "snakemake" in names
+    )
 
 
 def slurm_states(job_ids: set[str]) -> dict[str, str] | None:

@@ -1,0 +1,158 @@
+"""What a killed Snakemake leaves: a real one is killed; SLURM's answers come from a stand-in."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from ntop import cli
+from ntop.tools.alive import is_snakemake, processes_in, read_marks, slurm_states
+from ntop.tools.orphans import EXIT_ORPHANS
+from tests.tools.run_folder import PATIENCE_S, RunFolder, stand_in_for_squeue
+
+SHARD = "results/5_render/raw/loose/range/h1.0_r0.5/000000"
+SNAKEFILE = """
+rule make:
+    output: "made"
+    shell: "exec {python} -c 'import time; time.sleep(600)' --out {{output}}"
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    yield run
+    run.end()
+    for orphan in processes_in(run.folder).jobs.values():
+        os.kill(orphan, signal.SIGKILL)
+
+
+def look(run, capsys) -> tuple[int, str]:
+    code = cli.main(["orphans", "--directory", str(run.folder)])
+    return code, capsys.readouterr().out
+
+
+def test_nothing_left_is_said_and_is_no_error(run, capsys):
+    code, text = look(run, capsys)
+    assert (code, text) == (0, f"nothing is left in {run.folder}: start snakemake as usual\n")
+
+
+def test_a_killed_snakemake_and_the_job_that_outlives_it(run, capsys):
+    run.write("Snakefile", SNAKEFILE.format(python=sys.executable))
+    head = subprocess.Popen(
+        [sys.executable, "-m", "snakemake", "made", "--cores", "1", "--quiet", "all"],
+        cwd=run.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    run.processes.append(head)
+    patience = time.monotonic() + PATIENCE_S
+    while not (processes_in(run.folder).jobs and read_marks(run.folder)):
+        assert time.monotonic() < patience
+        time.sleep(0.1)
+    code, text = look(run, capsys)
+    assert code == 0
+    assert f"(process {head.pid}) on 1 outputs: nothing is orphaned" in text
+
+    head.kill()
+    head.wait()
+    (orphan,) = processes_in(run.folder).jobs.values()
+    code, text = look(run, capsys)
+    assert code == EXIT_ORPHANS
+    assert f"still running:\n  made, process {orphan} of this machine" in text
+    assert "Do not start snakemake yet" in text
+
+    remedy = next(line for line in text.splitlines() if line.startswith("  kill "))
+    subprocess.run(remedy.split(), check=True)
+    while processes_in(run.folder).jobs:
+        assert time.monotonic() < patience
+        time.sleep(0.1)
+    code, text = look(run, capsys)
+    assert code == 0
+    assert "gone:\n  made, " in text
+    assert "no output" in text
+    assert "  snakemake --unlock --cores 1" in text
+
+
+def test_slurms_jobs_are_looked_up_by_their_ids(run, capsys, tmp_path, monkeypatch):
+    run.mark(SHARD, job_id="11")
+    run.mark(SHARD + "1", job_id="11")  # a second output of the same job
+    run.mark("results/4_train/raw/loose", job_id="12")
+    run.mark("results/4_train/studio/plain", job_id="13")
+    run.write("results/4_train/studio/plain/avatar.json")
+    path = stand_in_for_squeue(tmp_path / "bin", lines="11|RUNNING\n12|PENDING")
+    monkeypatch.setenv("PATH", path)
+    before = {path: path.stat().st_mtime_ns for path in run.folder.rglob("*")}
+    code, text = look(run, capsys)
+    assert code == EXIT_ORPHANS
+    assert f"  {SHARD}, SLURM job 11 RUNNING, since " in text
+    assert "  results/4_train/raw/loose, SLURM job 12 PENDING, since " in text
+    assert "gone:\n  results/4_train/studio/plain, SLURM job 13, since " in text
+    assert sorted(text.split("scancel ")[1].splitlines()[0].split()) == ["11", "12"]
+    assert "--cleanup-metadata results/4_train/studio/plain --cores 1" in text
+    assert {path: path.stat().st_mtime_ns for path in run.folder.rglob("*")} == before
+
+
+def test_a_forgotten_job_is_gone(run, capsys, tmp_path, monkeypatch):
+    run.mark(SHARD, job_id="11")
+    error = "slurm_load_jobs error: Invalid job id specified"
+    monkeypatch.setenv("PATH", stand_in_for_squeue(tmp_path / "bin", error=error, code=1))
+    code, text = look(run, capsys)
+    assert code == 0
+    assert f"gone:\n  {SHARD}, SLURM job 11, since " in text
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_queue_that_does_not_answer_is_not_taken_for_empty(
+    run, capsys, tmp_path, monkeypatch, installed
+):
+    run.mark(SHARD, job_id="11")
+    path = stand_in_for_squeue(tmp_path / "bin", error="Unable to contact controller", code=1)
+    monkeypatch.setenv("PATH", path if installed else str(tmp_path))
+    code, text = look(run, capsys)
+    assert code == EXIT_ORPHANS
+    assert "perhaps running: squeue cannot be asked here" in text
+
+
+def test_a_job_of_this_machine_needs_no_mark(run, capsys):
+    process = run.start(SHARD)
+    code, text = look(run, capsys)
+    assert code == EXIT_ORPHANS
+    assert f"  {SHARD}, process {process.pid} of this machine, not marked" in text
+    assert f"  kill {process.pid}\n" in text
+
+
+def test_long_names_are_put_together_and_other_files_passed_over(run):
+    long = "results/" + "a/" * 150 + "end"
+    run.mark(long, job_id="7")
+    run.write(".snakemake/incomplete/migration_underway")
+    run.write(".snakemake/incomplete/cmVzdWx0cy9h", '{"external')  # half written
+    (mark,) = read_marks(run.folder)
+    assert (mark.output, mark.job_id) == (long, "7")
+
+
+def test_snakemake_writes_the_marks_that_we_read(run):
+    from snakemake.persistence.file import FilePersistence  # its own writer is the specification
+
+    keys = ["results/1_capture/raw/loose", "results/" + "b/" * 200 + "c", "a b/ü?>"]
+    persistence = FilePersistence(nolock=True, path=run.folder / ".snakemake")
+    for number, key in enumerate(keys):
+        persistence._mark_incomplete(key, str(number))
+    assert {mark.output: mark.job_id for mark in read_marks(run.folder)} == {
+        key: str(number) for number, key in enumerate(keys)
+    }
+
+
+def test_without_ids_nobody_is_asked(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert slurm_states(set()) == {}
+    assert slurm_states({"1"}) is None
+
+
+def test_snakemake_is_known_by_its_command_line():
+    assert is_snakemake(["/env/bin/python3", "/env/bin/snakemake", "--cores", "2"])
+    assert is_snakemake(["python", "-m", "snakemake"])
+    assert is_snakemake(["python3.11", "-u", "/env/bin/snakemake"])
+    assert not is_snakemake(["vi", "snakemake"])
+    assert not is_snakemake([])

@@ -7,9 +7,9 @@ below `results` or `logs` is `{number}_{stage}`, a job's place in it is its key.
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
 
+from ntop.config.run import Run
 from ntop.config.sections import STAGE_SECTIONS
-from ntop.config.tables import Actor, Sequence
-from ntop.config.whole import Config
+from ntop.config.tables import Sequence
 
 NUMBERS = {name: number for number, name in enumerate(STAGE_SECTIONS, start=1)}
 
@@ -71,12 +71,11 @@ def shard_frames(
     }
 
 
-def planned_jobs(
-    config: Config, actors: ListLike[Actor], sequences: ListLike[Sequence]
-) -> list[Job]:
+def planned_jobs(run: Run) -> list[Job]:
     """All jobs, stage by stage; what a source brings along needs none."""
+    config = run.config
     jobs = {name: [] for name in STAGE_SECTIONS}
-    for actor in actors:
+    for actor in run.actors:
         key, given = f"{actor.source}/{actor.actor}", config.sources[actor.source].provides
         fits = "bodies" not in given
         jobs["capture"].append(Job("capture", key))
@@ -86,7 +85,7 @@ def planned_jobs(
             jobs["fit"].append(Job("fit", key))
         jobs["train"].append(Job("train", key))
     size = config.render.sets_per_shard
-    shards = shard_frames(sequences, rigs=list(config.render.rigs), sets_per_shard=size)
+    shards = shard_frames(run.sequences, rigs=list(config.render.rigs), sets_per_shard=size)
     for stage in ("render", "annotate"):
         jobs[stage] += [Job(stage, key, frames) for key, frames in shards.items()]
     jobs["assemble"].append(Job("assemble", config.dataset))

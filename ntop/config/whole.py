@@ -41,6 +41,10 @@ class Config(Section):
     dataset: str = Field(pattern=r"^[a-z0-9_]+$")
     actors: str = Field(description="Path of the actors table (TSV).")
     sequences: str = Field(description="Path of the sequences table (TSV).")
+    plan: str = Field(
+        default="",
+        description="Frozen plan that `ntop plan` made; empty: shards of render.sets_per_shard.",
+    )
     sources: dict[str, Source]
     capture: CaptureKeys = CaptureKeys()
     mask: MaskConfig = MaskConfig()

@@ -5,15 +5,12 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from ntop.config.files import read_files
 from ntop.config.plan import NUMBERS, planned_jobs
-from ntop.config.tables import Actor, Sequence, read_tsv
-from ntop.config.whole import Config, check_tables, read_config
+from ntop.config.run import load_files
 from ntop.tools.alive import is_locked, processes_in, read_marks, slurm_states
 from ntop.tools.progress import progress_of, witness
 from ntop.tools.summary import Stage, Summary, summarise
 
-BASE = "config/config.yaml"  # the workflow's own `configfile:`
 HEADER = ("stage", "jobs", "done", "running", "failed", "remaining", "time each", "work left")
 
 
@@ -36,7 +33,7 @@ def main(
 
 def survey(configfiles: list[Path], *, directory: Path) -> Summary:
     """The figures of the run that these files configure, in `directory`."""
-    config, actors, sequences = load(configfiles, directory=directory)
+    run = load_files(configfiles, directory=directory)
     marks, processes = read_marks(directory), processes_in(directory)
     states = slurm_states({mark.job_id for mark in marks if mark.job_id is not None})
     notes = []
@@ -48,23 +45,8 @@ def survey(configfiles: list[Path], *, directory: Path) -> Summary:
             "`ntop orphans` explains"
         )
     seen = witness(marks, processes, states)
-    items = [
-        progress_of(job, directory=directory, seen=seen)
-        for job in planned_jobs(config, actors, sequences)
-    ]
-    return summarise(config.dataset, items, directory=directory, notes=tuple(notes))
-
-
-def load(configfiles: list[Path], *, directory: Path) -> tuple[Config, list[Actor], list[Sequence]]:
-    """Configuration and tables as the workflow loads them; table paths start at `directory`."""
-    base = directory / BASE
-    # as in Snakemake, files given by hand may replace a base that is not there
-    paths = [base, *configfiles] if base.exists() or not configfiles else configfiles
-    config = read_config(read_files(paths))
-    actors = read_tsv(directory / config.actors, Actor)
-    sequences = read_tsv(directory / config.sequences, Sequence)
-    check_tables(config, actors, sequences)
-    return config, actors, sequences
+    items = [progress_of(job, directory=directory, seen=seen) for job in planned_jobs(run)]
+    return summarise(run.config.dataset, items, directory=directory, notes=tuple(notes))
 
 
 def describe(summary: Summary) -> list[str]:

@@ -9,8 +9,9 @@ import pytest
 from ntop import cli
 from ntop.config.files import merge, read_files
 from ntop.config.plan import planned_jobs
+from ntop.config.run import load_files
 from ntop.conventions import ConfigError
-from ntop.tools.status import describe, load, survey, table
+from ntop.tools.status import describe, survey, table
 from tests.tools.run_folder import RunFolder, stand_in_for_squeue
 
 TEST_CONFIG = Path("config/test.yaml")
@@ -26,11 +27,11 @@ def run(tmp_path):
 
 def jobs_of(run: RunFolder):
     """Planned jobs by stage folder and key."""
-    return {job.name: job for job in planned_jobs(*load_test(run))}
+    return {job.name: job for job in planned_jobs(load_test(run))}
 
 
 def load_test(run: RunFolder):
-    return load([run.folder / TEST_CONFIG], directory=run.folder)
+    return load_files([run.folder / TEST_CONFIG], directory=run.folder)
 
 
 def look(run: RunFolder):

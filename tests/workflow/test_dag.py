@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from ntop.config.plan import planned_jobs
-from ntop.tools.status import load
+from ntop.config.run import load_files
+from ntop.tools import plan
 from tests.workflow.project import ROOT, TEST_CONFIG
 
 
@@ -40,8 +41,16 @@ def test_the_plan_that_status_reads_is_snakemakes(project, words):
     assert done.returncode == 0, done.stderr
     outputs = re.findall(r"^    output: (results/.*)$", done.stdout, re.MULTILINE)
     paths = [project.folder / word for word in words[1:]]
-    plan = planned_jobs(*load(paths, directory=project.folder))
-    assert sorted(outputs) == sorted(job.output for job in plan)
+    jobs = planned_jobs(load_files(paths, directory=project.folder))
+    assert sorted(outputs) == sorted(job.output for job in jobs)
+
+
+def test_a_frozen_plan_cuts_the_shards(project):
+    plan.main(project.folder / "plan.json", directory=project.folder, views_per_s=100)
+    done = project.snakemake("-n", "--quiet", "rules", "--config", "plan=plan.json")
+    assert done.returncode == 0, done.stderr
+    # 5 sequences x 2 rigs, each in one shard now
+    assert planned(done.stdout + done.stderr)["render"] == 10
 
 
 @pytest.mark.parametrize(

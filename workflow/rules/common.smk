@@ -4,18 +4,16 @@ import sys
 from pathlib import Path
 
 from ntop.config.plan import shard_frames
-from ntop.config.tables import Actor, Sequence, read_tsv
-from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
+from ntop.config.run import load_run
+from ntop.config.whole import body_model_of, stage_section
 from ntop.conventions import ConfigError
 from ntop.stages import VERSIONS
 
 try:
-    CONFIG = read_config(config)
-    ACTORS = read_tsv(Path(CONFIG.actors), Actor)
-    SEQUENCES = read_tsv(Path(CONFIG.sequences), Sequence)
-    check_tables(CONFIG, ACTORS, SEQUENCES)
+    RUN = load_run(config)
 except ConfigError as error:
     sys.exit(f"ntop: {error}")
+CONFIG, ACTORS, SEQUENCES = RUN.config, RUN.actors, RUN.sequences
 
 PACKAGES = "data/packages"
 # what a source says to later stages must not rerun its capture

@@ -2,12 +2,15 @@
 
 Snakemake marks every output it works on with a file below `.snakemake/incomplete`: its name is the
 output in base64, its content holds the cluster's job id. A mark goes away when its job ends *and*
-the head process is there to notice.
+the head process is there to notice. On SLURM the id is there only while the job is queued: on its
+node Snakemake starts once more and writes the mark anew, without it. A running job is found by its
+working directory and its comment, which names the rule and the wildcards.
 """
 
 import base64
 import binascii
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import dataclass
@@ -16,6 +19,7 @@ from pathlib import Path
 import psutil
 
 MARKS = ".snakemake/incomplete"
+SLURM_LOGS = ".snakemake/slurm_logs"
 QUEUED = frozenset({"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT"})
 
 
@@ -24,7 +28,7 @@ class Mark:
     """An output that a Snakemake process worked on when it was last heard of."""
 
     output: str
-    job_id: str | None  # of the cluster; None for a job on the head's own machine
+    job_id: str | None  # of the cluster; None if the job began, or is not of a cluster
     since: float  # seconds since the epoch
 
 
@@ -34,6 +38,15 @@ class Processes:
 
     heads: tuple[int, ...]  # process ids of Snakemake itself
     jobs: dict[str, int]  # output -> process id of the stage that makes it
+
+
+@dataclass(frozen=True)
+class SlurmJob:
+    """A job that SLURM has queued or runs."""
+
+    job_id: str
+    state: str  # in SLURM's words
+    comment: str  # `rule_{rule}_wildcards_{values}` if it is Snakemake's
 
 
 def read_marks(directory: Path) -> list[Mark]:
@@ -86,16 +99,31 @@ def is_snakemake(words: list[str]) -> bool:
     )
 
 
-def slurm_states(job_ids: set[str]) -> dict[str, str] | None:
-    """Job id -> state of those jobs that SLURM still has; None if it cannot be asked here."""
-    if not job_ids:
-        return {}
+def slurm_queue(directory: Path, marks: list[Mark]) -> list[SlurmJob] | None:
+    """Jobs of SLURM that belong to `directory`; None if some may exist and SLURM cannot be asked.
+
+    Asks for the whole queue: another user may have started the run in a shared folder.
+    """
+    place = str(directory.resolve())
+    was_used = (directory / SLURM_LOGS).is_dir() or any(mark.job_id for mark in marks)
+    silent = None if was_used else []
     if shutil.which("squeue") is None:
-        return None
-    words = ["squeue", "--noheader", "--array", "--format=%i|%T", f"--jobs={','.join(job_ids)}"]
+        return silent
+    words = ["squeue", "--noheader", "--array", "--format=%i|%T|%Z|%k"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        # what squeue says of a single job that it has forgotten; of several it just lists the rest
-        return {} if "Invalid job id" in done.stderr else None
-    rows = (line.strip().split("|") for line in done.stdout.splitlines())
-    return {row[0]: row[1] for row in rows if len(row) == 2}
+        return silent
+    rows = (line.strip().split("|", 3) for line in done.stdout.splitlines())
+    return [SlurmJob(row[0], row[1], row[3]) for row in rows if row[2:3] == [place]]
+
+
+def jobs_of(mark: Mark, queue: list[SlurmJob]) -> list[SlurmJob]:
+    """The jobs that make a marked output: more than one if a run was started twice."""
+    comment = slurm_comment(mark.output)
+    return [job for job in queue if job.job_id == mark.job_id or job.comment == comment]
+
+
+def slurm_comment(output: str) -> str | None:
+    """How the SLURM plugin describes the job of a stage's output; None for other outputs."""
+    found = re.fullmatch(r"results/[0-9]_([a-z]+)/(.+?)(\.parquet)?", output)
+    return found and f"rule_{found[1]}_wildcards_{found[2].replace('/', '_')}"

@@ -1,18 +1,26 @@
 """`ntop orphans`: what a killed Snakemake left behind, what of it still runs, and what to do.
 
 Whoever starts Snakemake again while jobs of a killed one still run gets every one of them twice:
-it knows of the old jobs (their ids lie in its marks), but does not look.
+it does not look whether the old ones still run.
 """
 
 import shlex
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from ntop.tools.alive import Mark, Processes, is_locked, processes_in, read_marks, slurm_states
+from ntop.tools.alive import (
+    Mark,
+    Processes,
+    SlurmJob,
+    is_locked,
+    jobs_of,
+    processes_in,
+    read_marks,
+    slurm_queue,
+)
 
 EXIT_ORPHANS = 3
 
@@ -23,13 +31,12 @@ Fate = Literal["runs", "gone", "unknown"]
 class Remnant:
     """One output that a killed Snakemake worked on, and what became of its job."""
 
-    output: str
+    output: str  # in brackets: what is known of a job whose output is not
     fate: Fate
     is_there: bool  # the output: whole, as stages publish by one rename
-    job_id: str | None = None  # of SLURM
-    slurm_state: str = ""
+    slurm: tuple[SlurmJob, ...] = ()
     process: int | None = None  # of this machine
-    since: float | None = None  # seconds since the epoch; None: Snakemake never marked it
+    since: float | None = None  # seconds since the epoch; None: Snakemake has no mark of it
 
 
 def main(directory: Path = Path()) -> int:
@@ -47,41 +54,42 @@ def main(directory: Path = Path()) -> int:
             "nothing is orphaned\n"
         )
         return 0
-    states = slurm_states({mark.job_id for mark in marks if mark.job_id is not None})
-    found = remnants(marks, processes, states, directory=directory)
+    queue = slurm_queue(directory, marks)
+    found = remnants(marks, processes, queue, directory=directory)
     lines = explain(found, locked=is_locked(directory), place=str(directory.resolve()))
     sys.stdout.write("\n".join(lines) + "\n")
     return EXIT_ORPHANS if any(item.fate != "gone" for item in found) else 0
 
 
 def remnants(
-    marks: Iterable[Mark],
+    marks: list[Mark],
     processes: Processes,
-    states: dict[str, str] | None,
+    queue: list[SlurmJob] | None,
     *,
     directory: Path,
 ) -> list[Remnant]:
-    """What is left, by output: all marks, and processes that no mark speaks of."""
-    found = []
+    """What is left, by output: all marks, and jobs that no mark speaks of.
+
+    `queue` is SLURM's of this directory, None if it cannot be asked.
+    """
     unmarked = dict(processes.jobs)
+    matched = {job for mark in marks for job in jobs_of(mark, queue or [])}
+    others = [job for job in queue or [] if job not in matched]
+    found = []
     for mark in marks:
+        slurm = tuple(jobs_of(mark, queue or []))
         process = unmarked.pop(mark.output, None)
-        state = (states or {}).get(mark.job_id or "", "")
-        asked = mark.job_id is None or states is not None
-        alive = process is not None or bool(state)
-        found.append(
-            Remnant(
-                output=mark.output,
-                fate="runs" if alive else "gone" if asked else "unknown",
-                is_there=(directory / mark.output).exists(),
-                job_id=mark.job_id,
-                slurm_state=state,
-                process=process,
-                since=mark.since,
-            )
-        )
+        fate: Fate = "gone"
+        if slurm or process is not None:
+            fate = "runs"
+        elif queue is None or others:
+            fate = "unknown"  # one of those jobs may be this mark's
+        there = (directory / mark.output).exists()
+        found.append(Remnant(mark.output, fate, there, slurm, process, mark.since))
     for output, process in sorted(unmarked.items()):
         found.append(Remnant(output, "runs", (directory / output).exists(), process=process))
+    for job in others:
+        found.append(Remnant(f"[{job.comment}]", "runs", False, (job,)))
     return found
 
 
@@ -97,7 +105,7 @@ def explain(found: list[Remnant], *, locked: bool, place: str) -> list[str]:
     ]
     for fate, title in (
         ("runs", "still running"),
-        ("unknown", "perhaps running: squeue cannot be asked here, look on a machine that has it"),
+        ("unknown", "perhaps running, as SLURM cannot be asked here or lists jobs without output"),
         ("gone", "gone"),
     ):
         some = [item for item in found if item.fate == fate]
@@ -108,14 +116,13 @@ def explain(found: list[Remnant], *, locked: bool, place: str) -> list[str]:
 
 def _line(item: Remnant) -> str:
     words = [item.output]
-    if item.job_id is not None:
-        words.append(f"SLURM job {item.job_id} {item.slurm_state}".rstrip())
+    words += [f"SLURM job {job.job_id} {job.state}" for job in item.slurm]
     if item.process is not None:
         words.append(f"process {item.process} of this machine")
     if item.since is not None:
         words.append(f"since {datetime.fromtimestamp(item.since):%Y-%m-%d %H:%M}")
     else:
-        words.append("not marked: started by hand?")
+        words.append("not marked by snakemake")
     if item.fate == "gone":
         words.append("its output is there" if item.is_there else "no output")
     return ", ".join(words)
@@ -157,8 +164,8 @@ def _remedies(found: list[Remnant], *, locked: bool) -> list[str]:
 
 def _ending(alive: list[Remnant]) -> list[str]:
     """Command lines that end jobs, each job once: a job may have several outputs."""
-    slurm = dict.fromkeys(item.job_id for item in alive if item.job_id is not None)
-    here = [str(item.process) for item in alive if item.process is not None and not item.job_id]
+    slurm = dict.fromkeys(job.job_id for item in alive for job in item.slurm)
+    here = [str(item.process) for item in alive if item.process is not None and not item.slurm]
     lines = []
     if slurm:
         lines.append(f"  scancel {shlex.join(slurm)}")

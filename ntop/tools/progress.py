@@ -10,7 +10,7 @@ from typing import Literal
 
 from ntop.config.plan import Job
 from ntop.conventions import VIEWS
-from ntop.tools.alive import QUEUED, Mark, Processes
+from ntop.tools.alive import QUEUED, Mark, Processes, SlurmJob, jobs_of
 
 State = Literal["done", "running", "queued", "stopped", "failed", "waiting"]
 
@@ -41,20 +41,19 @@ class Witness:
     marked: frozenset[str]  # running or queued when their Snakemake was last heard of
 
 
-def witness(marks: list[Mark], processes: Processes, states: dict[str, str] | None) -> Witness:
+def witness(marks: list[Mark], processes: Processes, queue: list[SlurmJob] | None) -> Witness:
     """Which outputs are being made.
 
-    A mark alone does not say so: it outlives a killed head process. With a job id the cluster
-    decides (if it cannot be asked, the mark is believed), without one a living head or job does.
+    A mark alone does not say so: it outlives a killed head process. SLURM's queue, a living head
+    or a working process does; if SLURM was used and cannot be asked, the mark is believed.
     """
     running, queued = set(processes.jobs), set()
     for mark in marks:
-        if mark.job_id is None:
-            running |= {mark.output} if processes.heads else set()
-        elif states is None:
+        states = {job.state for job in jobs_of(mark, queue or [])}
+        if states and states <= QUEUED:
+            queued.add(mark.output)
+        elif states or queue is None or (processes.heads and mark.job_id is None):
             running.add(mark.output)
-        elif mark.job_id in states:
-            (queued if states[mark.job_id] in QUEUED else running).add(mark.output)
     marked = frozenset(mark.output for mark in marks)
     return Witness(frozenset(running), frozenset(queued - running), marked)
 

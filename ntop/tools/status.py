@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ntop.config.plan import NUMBERS, planned_jobs
 from ntop.config.run import load_files
-from ntop.tools.alive import is_locked, processes_in, read_marks, slurm_states
+from ntop.tools.alive import is_locked, processes_in, read_marks, slurm_queue
 from ntop.tools.progress import progress_of, witness
 from ntop.tools.summary import Stage, Summary, summarise
 
@@ -35,16 +35,16 @@ def survey(configfiles: list[Path], *, directory: Path) -> Summary:
     """The figures of the run that these files configure, in `directory`."""
     run = load_files(configfiles, directory=directory)
     marks, processes = read_marks(directory), processes_in(directory)
-    states = slurm_states({mark.job_id for mark in marks if mark.job_id is not None})
+    queue = slurm_queue(directory, marks)
     notes = []
-    if states is None:
+    if queue is None:
         notes.append("squeue cannot be asked here: jobs handed to SLURM count as running")
     if not processes.heads and (marks or is_locked(directory)):
         notes.append(
             "no snakemake works here on this machine, but one left its lock or marks behind: "
             "`ntop orphans` explains"
         )
-    seen = witness(marks, processes, states)
+    seen = witness(marks, processes, queue)
     items = [progress_of(job, directory=directory, seen=seen) for job in planned_jobs(run)]
     return summarise(run.config.dataset, items, directory=directory, notes=tuple(notes))
 

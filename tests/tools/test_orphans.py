@@ -9,7 +9,7 @@ import time
 import pytest
 
 from ntop import cli
-from ntop.tools.alive import is_snakemake, processes_in, read_marks, slurm_states
+from ntop.tools.alive import is_snakemake, processes_in, read_marks, slurm_comment
 from ntop.tools.orphans import EXIT_ORPHANS
 from tests.tools.run_folder import PATIENCE_S, RunFolder, stand_in_for_squeue
 
@@ -75,44 +75,66 @@ def test_a_killed_snakemake_and_the_job_that_outlives_it(run, capsys):
     assert "  snakemake --unlock --cores 1" in text
 
 
-def test_slurms_jobs_are_looked_up_by_their_ids(run, capsys, tmp_path, monkeypatch):
-    run.mark(SHARD, job_id="11")
-    run.mark(SHARD + "1", job_id="11")  # a second output of the same job
+def test_slurms_jobs_are_known_by_id_while_queued_and_by_comment_while_running(
+    run, capsys, tmp_path, monkeypatch
+):
+    run.mark(SHARD)  # running: its mark has lost the id
     run.mark("results/4_train/raw/loose", job_id="12")
     run.mark("results/4_train/studio/plain", job_id="13")
     run.write("results/4_train/studio/plain/avatar.json")
-    path = stand_in_for_squeue(tmp_path / "bin", lines="11|RUNNING\n12|PENDING")
+    here = run.folder
+    lines = [
+        f"11|RUNNING|{here}|rule_render_wildcards_raw_loose_range_h1.0_r0.5_000000",
+        f"12|PENDING|{here}|rule_train_wildcards_raw_loose",
+        f"14|RUNNING|{here.parent}|rule_train_wildcards_studio_plain",  # of another folder
+    ]
+    path = stand_in_for_squeue(tmp_path / "bin", lines="\n".join(lines))
     monkeypatch.setenv("PATH", path)
     before = {path: path.stat().st_mtime_ns for path in run.folder.rglob("*")}
     code, text = look(run, capsys)
     assert code == EXIT_ORPHANS
     assert f"  {SHARD}, SLURM job 11 RUNNING, since " in text
     assert "  results/4_train/raw/loose, SLURM job 12 PENDING, since " in text
-    assert "gone:\n  results/4_train/studio/plain, SLURM job 13, since " in text
+    assert "gone:\n  results/4_train/studio/plain, since " in text
     assert sorted(text.split("scancel ")[1].splitlines()[0].split()) == ["11", "12"]
     assert "--cleanup-metadata results/4_train/studio/plain --cores 1" in text
     assert {path: path.stat().st_mtime_ns for path in run.folder.rglob("*")} == before
 
 
-def test_a_forgotten_job_is_gone(run, capsys, tmp_path, monkeypatch):
-    run.mark(SHARD, job_id="11")
-    error = "slurm_load_jobs error: Invalid job id specified"
-    monkeypatch.setenv("PATH", stand_in_for_squeue(tmp_path / "bin", error=error, code=1))
+def test_a_job_of_unknown_output_leaves_no_mark_for_gone(run, capsys, tmp_path, monkeypatch):
+    run.mark(SHARD)
+    line = f"11|RUNNING|{run.folder}|group_job"
+    monkeypatch.setenv("PATH", stand_in_for_squeue(tmp_path / "bin", lines=line))
     code, text = look(run, capsys)
-    assert code == 0
-    assert f"gone:\n  {SHARD}, SLURM job 11, since " in text
+    assert code == EXIT_ORPHANS
+    assert "still running:\n  [group_job], SLURM job 11 RUNNING" in text
+    assert (
+        f"perhaps running, as SLURM cannot be asked here or lists jobs without output:\n  {SHARD}"
+        in text
+    )
+    assert "  scancel 11\n" in text
+
+
+def test_a_run_started_twice_shows_both_jobs(run, capsys, tmp_path, monkeypatch):
+    run.mark("results/4_train/raw/loose")
+    lines = [f"{n}|RUNNING|{run.folder}|rule_train_wildcards_raw_loose" for n in (7, 8)]
+    monkeypatch.setenv("PATH", stand_in_for_squeue(tmp_path / "bin", lines="\n".join(lines)))
+    _, text = look(run, capsys)
+    assert "raw/loose, SLURM job 7 RUNNING, SLURM job 8 RUNNING, since " in text
+    assert "  scancel 7 8\n" in text
 
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_a_queue_that_does_not_answer_is_not_taken_for_empty(
     run, capsys, tmp_path, monkeypatch, installed
 ):
-    run.mark(SHARD, job_id="11")
+    run.mark(SHARD)
+    run.write(".snakemake/slurm_logs/rule_render/11.log")  # SLURM was used here
     path = stand_in_for_squeue(tmp_path / "bin", error="Unable to contact controller", code=1)
     monkeypatch.setenv("PATH", path if installed else str(tmp_path))
     code, text = look(run, capsys)
     assert code == EXIT_ORPHANS
-    assert "perhaps running: squeue cannot be asked here" in text
+    assert "perhaps running, as SLURM cannot be asked here" in text
 
 
 def test_a_job_of_this_machine_needs_no_mark(run, capsys):
@@ -144,10 +166,24 @@ def test_snakemake_writes_the_marks_that_we_read(run):
     }
 
 
-def test_without_ids_nobody_is_asked(monkeypatch, tmp_path):
+def test_a_machine_without_slurm_is_not_asked_about_it(run, capsys, tmp_path, monkeypatch):
+    run.mark(SHARD)
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm_states(set()) == {}
-    assert slurm_states({"1"}) is None
+    code, text = look(run, capsys)
+    assert code == 0
+    assert f"gone:\n  {SHARD}, since " in text
+
+
+@pytest.mark.parametrize(
+    ("output", "comment"),
+    [
+        (SHARD, "rule_render_wildcards_raw_loose_range_h1.0_r0.5_000000"),
+        ("results/6_annotate/a/b/c/d/000000.parquet", "rule_annotate_wildcards_a_b_c_d_000000"),
+        ("data/packages/pose2sim", None),
+    ],
+)
+def test_outputs_are_described_as_the_slurm_plugin_does(output, comment):
+    assert slurm_comment(output) == comment
 
 
 def test_snakemake_is_known_by_its_command_line():

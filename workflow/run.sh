@@ -4,14 +4,23 @@ set -euo pipefail
 dataset=$1
 cores=$2
 shift 2
-# A killed run leaves its lock behind. Nobody else works here if no process holds the folder's lock.
+# A killed run leaves its lock behind. No other run works here if no process holds the folder's lock.
 mkdir -p results
 exec 9>results/.run.lock
-# Jobs of a killed run hold it too until the kernel has buried them, hence the patience.
-if ! flock --timeout "${NTOP_LOCK_WAIT_S:-30}" 9; then
+patience=${NTOP_LOCK_WAIT_S:-30}
+if ! flock --timeout "$patience" 9; then
   echo "ntop: another run works in $PWD; wait for it, or stop it first" >&2
   exit 1
 fi
+# Jobs do not hold that lock: those of a killed run would be started twice, beside themselves. The
+# patience is for those that the kernel has yet to bury.
+until left=$(ntop orphans); do
+  if ((SECONDS >= patience)); then
+    echo "$left" >&2
+    exit 1
+  fi
+  sleep 1
+done
 snakemake --unlock --cores "$cores" --quiet all "$@" >/dev/null
 snakemake --cores "$cores" --quiet progress "$@"
 echo

@@ -3,7 +3,8 @@
 Snakemake counts `--resources gpu=N` but assigns nothing: without a lease all jobs of a workstation
 start on GPU 0. A lease is a file lock per GPU that the command inherits, so the kernel frees it
 however the command ends, SIGKILL included: there are no pid files and no stale locks. (What the
-command leaves running in the background keeps its GPU.)
+command leaves running in the background keeps its GPU.) Locks are each user's own: several users
+of one machine give themselves pools that do not overlap.
 
 | variable | meaning |
 |---|---|

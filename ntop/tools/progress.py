@@ -124,7 +124,10 @@ def log_tail(log: Path) -> str:
 
 
 def seconds_per_unit(stage: list[Progress]) -> float | None:
-    """What one set of a shard, or one job of another stage, takes; None if nothing tells yet."""
+    """What one set of a shard, or one job of another stage, takes; None if nothing tells yet.
+
+    A job that went on after a stop counts with its last attempt only: the mean is then too small.
+    """
     timed = [item for item in stage if item.seconds is not None]
     units = sum(_units(item) for item in timed)
     if units:

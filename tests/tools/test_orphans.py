@@ -1,17 +1,19 @@
 """What a killed Snakemake leaves: a real one is killed; SLURM's answers come from a stand-in."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from ntop import cli
 from ntop.tools.alive import is_snakemake, processes_in, read_marks, slurm_comment
 from ntop.tools.orphans import EXIT_ORPHANS
-from tests.tools.run_folder import PATIENCE_S, RunFolder, stand_in_for_squeue
+from tests.tools.run_folder import PATIENCE_S, ROOT, RunFolder, stand_in_for_squeue
 
 SHARD = "results/5_render/raw/loose/range/h1.0_r0.5/000000"
 SNAKEFILE = """
@@ -143,6 +145,23 @@ def test_a_job_of_this_machine_needs_no_mark(run, capsys):
     assert code == EXIT_ORPHANS
     assert f"  {SHARD}, process {process.pid} of this machine, not marked" in text
     assert f"  kill {process.pid}\n" in text
+
+
+def test_the_run_script_starts_nothing_beside_orphans(run):
+    process = run.start(SHARD)
+    shutil.copytree(ROOT / "workflow", run.folder / "workflow")
+    environment = os.environ | {
+        "NTOP_LOCK_WAIT_S": "1",
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    }
+    done = subprocess.run(
+        ["workflow/run.sh", "test", "1"],
+        cwd=run.folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert f"  kill {process.pid}\n" in done.stderr
+    assert not (run.folder / ".snakemake").exists()
 
 
 def test_long_names_are_put_together_and_other_files_passed_over(run):

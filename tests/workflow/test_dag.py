@@ -35,6 +35,14 @@ def test_what_a_source_brings_along_is_not_in_the_plan(project):
     assert "results/3_fit/studio/plain" not in done.stdout
 
 
+def test_a_gpu_that_a_rule_is_given_reaches_its_lease(project):
+    words = ["-n", "-p", *TEST_CONFIG, "--resources", "gpu=2", "--set-resources", "render:gpu=1"]
+    done = project.snakemake(*words)
+    assert done.returncode == 0, done.stderr
+    assert "exec ntop lease -n 1 -- ntop render" in done.stdout
+    assert "exec ntop lease -n 0 -- ntop train" in done.stdout
+
+
 @pytest.mark.parametrize("words", [[], TEST_CONFIG])
 def test_the_plan_that_status_reads_is_snakemakes(project, words):
     done = project.snakemake("-n", *words)

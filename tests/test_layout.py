@@ -46,7 +46,8 @@ def test_the_conda_file_only_installs_the_package():
 
 def test_every_dependency_is_pinned_in_the_constraints():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
+    extras = project["optional-dependencies"]
+    wanted = project["dependencies"] + extras["dev"] + extras["slurm"]
     pins = (ROOT / "constraints.txt").read_text().lower().splitlines()
     pinned = {line.split("==")[0].replace("_", "-") for line in pins if "==" in line}
     assert {re.split(r"[<>=]", name)[0].lower() for name in wanted} <= pinned

@@ -8,6 +8,7 @@ import pytest
 
 from ntop.config.plan import planned_jobs
 from ntop.config.run import load_files
+from ntop.stages import STAGES
 from ntop.tools import plan
 from tests.workflow.project import ROOT, TEST_CONFIG
 
@@ -95,6 +96,19 @@ def test_a_new_actor_adds_its_own_jobs_only(project):
     assert {k: v for k, v in added.items() if k != "total"} == {
         "capture": 1, "train": 1, "render": 2, "annotate": 2,
     }  # fmt: skip
+
+
+def test_the_slurm_profile_gives_every_job_its_time_memory_and_signal(project):
+    done = project.snakemake("-n", "--profile", "profiles/slurm")
+    assert done.returncode == 0, done.stdout + done.stderr
+    pattern = r"^rule (\w+):$.*?^    resources: (.*?)$"
+    resources = dict(re.findall(pattern, done.stdout, re.MULTILINE | re.DOTALL))
+    assert {name for _, name, _ in STAGES} < set(resources)
+    for text in resources.values():
+        assert re.search(r"\bmem_mb=\d+", text)
+        assert re.search(r"\bruntime=\d+", text)
+    signals = {name for name, text in resources.items() if "slurm_extra=--signal=TERM@" in text}
+    assert signals == {"train", "render"}  # the stages that continue where they stopped
 
 
 @pytest.mark.workflow

@@ -11,7 +11,7 @@ rule capture:
     conda:
         "../../environment.yml"
     resources:
-        mem_mb=2000,
+        mem_mb=memory_mb(2000),
     params:
         config=capture_params,
         packages=PACKAGES,

@@ -13,7 +13,7 @@ rule mask:
         "../../environment.yml"
     threads: 2
     resources:
-        mem_mb=3000,
+        mem_mb=memory_mb(3000),
     params:
         config=stage_params("mask"),
         packages=PACKAGES,

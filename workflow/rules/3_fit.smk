@@ -15,7 +15,7 @@ rule fit:
         "../../environment.yml"
     threads: 2
     resources:
-        mem_mb=4000,
+        mem_mb=memory_mb(4000),
     params:
         config=body_stage_params("fit"),
     shell:

@@ -15,7 +15,7 @@ rule train:
         "../../environment.yml"
     threads: 2
     resources:
-        mem_mb=6000,
+        mem_mb=memory_mb(6000),
         gpu=0,
     params:
         config=body_stage_params("train"),

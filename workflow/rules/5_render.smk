@@ -14,7 +14,7 @@ rule render:
     conda:
         "../../environment.yml"
     resources:
-        mem_mb=3000,
+        mem_mb=memory_mb(3000),
         gpu=0,
     params:
         config=body_stage_params("render"),

@@ -11,7 +11,7 @@ rule annotate:
     conda:
         "../../environment.yml"
     resources:
-        mem_mb=1000,
+        mem_mb=memory_mb(1000),
     params:
         config=stage_params("annotate"),
     shell:

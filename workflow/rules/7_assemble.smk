@@ -13,7 +13,7 @@ rule assemble:
     conda:
         "../../environment.yml"
     resources:
-        mem_mb=2000,
+        mem_mb=memory_mb(2000),
     params:
         config=assemble_params,
     shell:

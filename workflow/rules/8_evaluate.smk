@@ -17,7 +17,7 @@ rule evaluate:
         "../../environment.yml"
     threads: 2
     resources:
-        mem_mb=4000,
+        mem_mb=memory_mb(4000),
     params:
         config=evaluate_params,
         benchmarks="results/benchmarks",

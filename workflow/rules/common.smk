@@ -44,6 +44,18 @@ def stage_params(stage):
     return section_of
 
 
+def memory_mb(first):
+    """A resource function: twice as much once an attempt has failed, in case it lacked memory.
+
+    Not more: under SLURM a training that needs several time slices has as many attempts.
+    """
+
+    def of_attempt(wildcards, attempt):
+        return first * min(attempt, 2)
+
+    return of_attempt
+
+
 def body_model(wildcards):
     """The actor's SMPL file as a list of inputs, empty for the embedded body."""
     key = (wildcards.source, wildcards.actor)

@@ -20,6 +20,7 @@ include: "workflow/rules/8_evaluate.smk"
 
 localrules:
     all,
+    actor,
     fetch,  # a cluster's compute nodes seldom reach the internet
 
 

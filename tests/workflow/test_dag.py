@@ -84,6 +84,20 @@ def test_an_actor_in_two_splits_stops_at_once(project):
     assert "studio/plain is listed twice" in done.stdout + done.stderr
 
 
+def test_one_actor_can_be_asked_for_alone(project):
+    target = "results/6_annotate/studio/plain/done"
+    done = project.snakemake(target, "-n", "--quiet", "rules", *TEST_CONFIG)
+    assert planned(done.stdout) == {
+        "capture": 1, "train": 1, "render": 2, "annotate": 2, "actor": 1, "total": 7,
+    }  # fmt: skip
+
+
+def test_an_actor_without_shards_is_no_target(project):
+    done = project.snakemake("-n", "results/6_annotate/studio/nobody/done", *TEST_CONFIG)
+    assert done.returncode != 0
+    assert "has no render line of studio/nobody" in done.stdout + done.stderr
+
+
 def test_a_new_actor_adds_its_own_jobs_only(project):
     before = planned(project.snakemake("-n", "--quiet", "rules", *TEST_CONFIG).stdout)
     with (project.folder / "config/test/actors.tsv").open("a") as table:

@@ -17,3 +17,11 @@ rule annotate:
     shell:
         "exec ntop annotate --config {params.config:q} --renders {input.renders:q}"
         " --out {output:q} 2> {log:q}"
+
+
+# all shards of one actor: the target for running a campaign in slices
+rule actor:
+    input:
+        actor_shards,
+    output:
+        touch("results/6_annotate/{source}/{actor}/done"),

@@ -234,3 +234,12 @@ SHARDS = shard_frames(
     rigs=list(CONFIG.render.rigs),
     sets_per_shard=CONFIG.render.sets_per_shard,
 )
+
+
+def actor_shards(wildcards):
+    """The annotations of everything that is rendered of one actor."""
+    actor = f"{wildcards.source}/{wildcards.actor}"
+    shards = [shard for shard in SHARDS if shard.startswith(f"{actor}/")]
+    if not shards:
+        raise ValueError(f"{CONFIG.sequences} has no render line of {actor}")
+    return [f"results/6_annotate/{shard}.parquet" for shard in shards]

@@ -75,8 +75,8 @@ MaxJobCount=20000
 GresTypes=gpu
 AccountingStorageType=accounting_storage/none
 NodeName=$HOST NodeAddr=127.0.0.1 Port=$SLURMD_PORT CPUs=$CPUS RealMemory=$MEM Gres=gpu:fake:$NGPU State=UNKNOWN
-PartitionName=cpu  Nodes=$HOST Default=YES MaxTime=24:00:00 State=UP PriorityTier=1 GraceTime=10
-PartitionName=gpu  Nodes=$HOST Default=NO  MaxTime=48:00:00 State=UP PriorityTier=1 GraceTime=10
+PartitionName=cpu  Nodes=$HOST Default=YES MaxTime=24:00:00 State=UP PriorityTier=1
+PartitionName=gpu  Nodes=$HOST Default=NO  MaxTime=48:00:00 State=UP PriorityTier=1
 PartitionName=urgent Nodes=$HOST Default=NO MaxTime=1:00:00 State=UP PriorityTier=10 PreemptMode=off
 CONF
 cat > "$ROOT/etc/gres.conf" <<CONF

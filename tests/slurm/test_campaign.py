@@ -78,9 +78,9 @@ def inodes(folder: Path) -> dict[str, int]:
 
 def test_a_training_at_its_time_limit_goes_on_in_the_next_attempt(campaign, resumed):
     shutil.rmtree(resumed.folder / AVATAR)
-    # SLURM looks at the clock every half minute: the signal comes 15 to 45 s after the start, on a
+    # SLURM looks at the clock every half minute: the signal comes 30 to 60 s after the start, on a
     # busy machine perhaps before the training has begun, hence the spare attempts
-    soon = {"runtime": 1, "slurm_extra": "'--signal=TERM@45'"}
+    soon = {"runtime": 2, "slurm_extra": "'--signal=TERM@60'"}
     resumed.use_profile(stages={"train": soon}, retries=3)
     head = resumed.head(AVATAR, *TEST_CONFIG)
     freeze_at(resumed, "results/work/4_train/studio/plain", "checkpoint.safetensors")

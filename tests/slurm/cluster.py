@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -127,6 +128,7 @@ class SlurmProject(Project):
         super().__init__(folder)
         shutil.copy(HERE / "toy.smk", folder)
         self.environment = cluster.visible_to(self.environment)
+        self.heads: list[subprocess.Popen[str]] = []
         self.use_profile()
 
     def use_profile(self, *, stages: dict[str, dict[str, Any]] | None = None, **keys: Any) -> None:
@@ -142,7 +144,7 @@ class SlurmProject(Project):
     def head(self, *words: str) -> subprocess.Popen[str]:
         """Start Snakemake on the head; its words go to `head.log`."""
         with (self.folder / "head.log").open("a") as log:
-            return subprocess.Popen(
+            head = subprocess.Popen(
                 ["snakemake", "--profile", "profiles/test", *words],
                 cwd=self.folder,
                 env=self.environment,
@@ -150,7 +152,17 @@ class SlurmProject(Project):
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 text=True,
+                # a test run in the background ignores SIGINT, and its children would inherit that
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
+        self.heads.append(head)
+        return head
+
+    def end(self) -> None:
+        """Kill the heads that a failed test left."""
+        for head in self.heads:
+            head.kill()
+            head.wait()
 
     def submit(self, *words: str) -> int:
         """Run the head to its end; returns its exit code."""

@@ -24,7 +24,9 @@ def cluster():
 
 @pytest.fixture
 def project(cluster, tmp_path):
-    return SlurmProject(tmp_path, cluster)
+    project = SlurmProject(tmp_path, cluster)
+    yield project
+    project.end()
 
 
 @pytest.fixture(scope="session")

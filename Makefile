@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint rulegraph
+.PHONY: env demo studio test lint numerics rulegraph
 
 env: $(VENV)/.ready
 
@@ -36,6 +36,11 @@ lint: env
 	$(RUN) snakefmt --check Snakefile workflow
 	$(RUN) lint-imports
 	$(RUN) snakemake --lint
+
+# the acceptance suite for arithmetic, with its measured margins written into docs/numerics.md
+numerics: env
+	$(RUN) python -m pytest tests/numerics -n $(CORES) --junitxml=$(VENV)/numerics.xml
+	$(RUN) python scripts/write_numerics_page.py $(VENV)/numerics.xml
 
 rulegraph: env
 	$(RUN) scripts/draw_rulegraph.sh

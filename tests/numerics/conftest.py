@@ -26,7 +26,7 @@ class Margins:
         assert measured >= limit, f"{what}: {measured:.3g} {unit}, expected at least {limit:.3g}"
 
     def mutant_exceeds(self, what: str, measured: float, limit: float, unit: str = "") -> None:
-        """A deliberately wrong formula that the case's `limit` must catch (NaN counts as caught)."""
+        """A deliberately wrong formula that the case's `limit` must catch; NaN is caught."""
         self._keep("mutant above", what, measured, limit, unit)
         caught = math.isnan(measured) or measured > limit
         assert caught, f"{what}: the mutant's {measured:.3g} {unit} passes the limit {limit:.3g}"

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from ntop.conventions import DEPTH_STEP_M, DataError
 from ntop.storage.atomic import write_bytes
-from ntop.storage.png import encode_png
+from ntop.storage.png import decode_png, encode_png
 
 DILATION_PX = 3  # straight colour reaches this far beyond alpha > 0: scaling mixes in no black
 DEPTH_LIMIT_M = 65535 * DEPTH_STEP_M
@@ -93,8 +93,7 @@ def write_matte(matte: Float[ndarray, "height width"], *, path: Path) -> None:
 
 def read_rgba(path: Path) -> UInt8[ndarray, "height width 4"]:
     """Straight-alpha RGBA, 8 bit; the mask is channel 3 >= `MASK_ALPHA`."""
-    pixels = _read(path, channels=4, dtype=np.uint8)
-    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
+    return _read(path, channels=4, dtype=np.uint8)
 
 
 def read_depth(path: Path) -> Float[ndarray, "height width"]:
@@ -145,14 +144,15 @@ def _dilated(
 
 def _read(path: Path, *, channels: int, dtype: type) -> np.ndarray:
     try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
+        pixels = decode_png(path.read_bytes())
     except OSError as error:
         raise DataError(
             f"cannot read image {path}: {error.strerror or error}; rerun the stage that writes it"
         ) from error
-    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
-    if pixels is None:
-        raise DataError(f"{path} is not a whole PNG; delete it and rerun the stage that writes it")
+    except ValueError as error:
+        raise DataError(
+            f"{path} is not a whole PNG: {error}; delete it and rerun the stage that writes it"
+        ) from error
     got = 1 if pixels.ndim == 2 else pixels.shape[2]
     if got != channels or pixels.dtype != dtype:
         raise DataError(

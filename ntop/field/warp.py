@@ -66,8 +66,8 @@ def pose_warp(
     candidates, nodes = np.nonzero(nearest >= 0)
     records = np.empty((len(nodes), 6), np.float32)
     node_records(
-        np.stack([nodes, candidates], 1), vertices, body.faces, body.ring_offsets, body.ring_faces,
-        maps, normals, dims, cell_m, nearest, distance, records,
+        np.stack([nodes, candidates], 1), vertices, body.vertices, body.faces, body.ring_offsets,
+        body.ring_faces, maps, normals, dims, cell_m, nearest, distance, records,
     )  # fmt: skip
     record_of = np.full((2, count), -1, np.int32)
     record_of[candidates, nodes] = np.arange(len(nodes))

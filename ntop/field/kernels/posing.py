@@ -186,37 +186,64 @@ def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces, weights)
     return chosen, best
 
 
+@device
+def way_back(p, v, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, record):
+    """Canonical position and world normal of a point, from the surface around vertex v closest.
+
+    The closest surface point q goes back exactly, as the mean of its triangle's corners; what lies
+    off it, p - q, follows the mean of their maps. (The mean of the corners' affine maps of p would
+    miss the surface between vertices, by a centimetre on a bent elbow's large triangles.)
+
+    Args:
+        p: (3,) metres, as `posed`. v: vertex nearest to p (or nearest of one part).
+        posed, canonical, normals: (V, 3). maps: (V, 3, 4) posed -> canonical.
+        record: (6,) output.
+
+    Returns:
+        Squared distance of p to the surface.
+    """
+    weights = np.empty(3, np.float64)
+    face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
+    x, y, z = p[0], p[1], p[2]  # becomes p - q
+    for corner in range(3):
+        u = faces[face, corner]
+        x -= weights[corner] * posed[u, 0]
+        y -= weights[corner] * posed[u, 1]
+        z -= weights[corner] * posed[u, 2]
+    for i in range(3):
+        position, normal = 0.0, 0.0
+        for corner in range(3):
+            u = faces[face, corner]
+            m = maps[u, i]
+            position += weights[corner] * (canonical[u, i] + m[0] * x + m[1] * y + m[2] * z)
+            normal += weights[corner] * normals[u, i]
+        record[i] = position
+        record[3 + i] = normal
+    return squared
+
+
 @kernel
 def node_records(
-    node_ids, posed, faces, ring_offsets, ring_faces, maps, normals, dims, cell, nearest, distance,
-    records,
+    node_ids, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, dims, cell,
+    nearest, distance, records,
 ):  # fmt: skip
     """Canonical position and normal of each listed node, from the surface closest to it.
 
     Args:
-        node_ids: (any, 2) node number and candidate (0, 1). maps, normals: per vertex.
+        node_ids: (any, 2) node number and candidate (0, 1). Others: see `way_back`.
         distance: (2, nodes) squared metres; sharpened from vertex to surface distance.
         records: (any, 6) output.
     """
     for n in numba.prange(node_ids.shape[0]):
         node, candidate = node_ids[n, 0], node_ids[n, 1]
         p = np.empty(3, np.float64)
-        weights = np.empty(3, np.float64)
         p[0] = (node // (dims[1] * dims[2])) * cell
         p[1] = (node // dims[2] % dims[1]) * cell
         p[2] = (node % dims[2]) * cell
-        v = nearest[candidate, node]
-        face, d = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
-        distance[candidate, node] = d
-        for i in range(3):
-            position, normal = 0.0, 0.0
-            for corner in range(3):
-                u = faces[face, corner]
-                m = maps[u, i]
-                position += weights[corner] * (m[0] * p[0] + m[1] * p[1] + m[2] * p[2] + m[3])
-                normal += weights[corner] * normals[u, i]
-            records[n, i] = position
-            records[n, 3 + i] = normal
+        distance[candidate, node] = way_back(
+            p, nearest[candidate, node], posed, canonical, faces, ring_offsets, ring_faces, maps,
+            normals, records[n],
+        )  # fmt: skip
 
 
 @device

@@ -204,6 +204,16 @@ def way_back(p, v, posed, canonical, faces, ring_offsets, ring_faces, maps, norm
     """
     weights = np.empty(3, np.float64)
     face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
+    last = np.inf
+    while squared < last:  # the closest vertex need not be a corner of the closest face
+        heaviest = 0
+        for corner in range(1, 3):
+            if weights[corner] > weights[heaviest]:
+                heaviest = corner
+        if faces[face, heaviest] == v:
+            break
+        v, last = faces[face, heaviest], squared
+        face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
     x, y, z = p[0], p[1], p[2]  # becomes p - q
     for corner in range(3):
         u = faces[face, corner]

@@ -26,7 +26,7 @@ from ntop.field.canonical import (
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
 from ntop.field.warp import PoseWarp, occupied, octant_radius_m, pose_warp
-from ntop.geometry.cameras import Camera, Equidistant
+from ntop.geometry.cameras import Camera, Lens
 
 CELL_M = 0.012  # of the warp grid; a coarser one bends wrongly at joints (0.02: -0.6 dB)
 # four rays of a pixel on a rotated grid: distinct rows and columns, unbiased about the centre
@@ -208,24 +208,37 @@ def body_pixels(posed: PosedAvatar, camera: Camera) -> Bool[np.ndarray, "height 
     full = np.flatnonzero((cells >= 0) & (tables.occupancy[np.maximum(cells, 0)] != 0))
     index = np.stack(np.unravel_index(full, tables.dims[0]), 1)
     centres = torch.from_numpy((index + 0.5) * cell_m + posed.warp.origin_world)
-    pixels, seen = camera.project(centres)
-    distances = (centres - camera.center_world).norm(dim=-1)
-    if isinstance(camera.lens, Equidistant):
-        # px per rad is f along the radius and f theta / sin(theta) across it
-        seen = seen | torch.isfinite(pixels).all(-1)
-        stretch = camera.lens.max_theta / max(math.sin(camera.lens.max_theta), 0.1)
-        px_per_rad = camera.lens.focal * max(1.0, stretch)
-    else:
-        # a pinhole's scale grows to f / cos^2 at the corner
-        corner = math.hypot(width / camera.lens.fx, height / camera.lens.fy) / 2
-        px_per_rad = max(camera.lens.fx, camera.lens.fy) * (1 + corner**2)
-    marked = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.uint8)
+    offsets = (centres - camera.center_world) @ camera.rotation.T
+    distances = offsets.norm(dim=-1)
     radius = cell_m * math.sqrt(3) / 2
+    marked = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.uint8)
     if len(full) and float(distances.min()) < 2 * radius:
         marked[:] = 1  # the camera is inside the body: every pixel may see it
     else:
-        mark_tiles(pixels.numpy(), distances.numpy(), seen.numpy(), radius, px_per_rad, marked)
+        pixels, radii_px, usable = _blots(offsets, torch.asin(radius / distances), camera.lens)
+        mark_tiles(pixels.numpy(), radii_px.numpy(), usable.numpy(), marked)
     return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[:height, :width].astype(bool)
+
+
+def _blots(
+    offsets: Float[Tensor, "cell 3"], angles: Float[Tensor, " cell"], lens: Lens
+) -> tuple[Float[Tensor, "cell 2"], Float[Tensor, " cell"], Bool[Tensor, " cell"]]:
+    """Discs in the image that hold those of small spheres, for any lens: centres, radii, which.
+
+    `angles` are the spheres' angular radii. A sphere whose centre the lens does not image stands
+    for itself on the rim, at most its own angle away, so that its disc is twice as large. Seen
+    from the camera's frame, beyond 90 degrees as well.
+    """
+    across = torch.hypot(offsets[:, 0], offsets[:, 1])
+    theta = torch.atan2(across, offsets[:, 2])
+    rim = lens.max_theta * (1 - 1e-9)  # inside whatever the rounding
+    outside = theta > rim
+    azimuth = torch.atan2(offsets[:, 1], offsets[:, 0])
+    sine, cosine = math.sin(rim), torch.full_like(theta, math.cos(rim))
+    on_rim = torch.stack([sine * azimuth.cos(), sine * azimuth.sin(), cosine], -1)
+    pixels, _ = lens.project(torch.where(outside[:, None], on_rim, offsets))
+    radii_px = lens.max_px_per_rad * angles * (1 + outside.double())
+    return pixels, radii_px, theta - angles <= lens.max_theta
 
 
 def _trace_pixels(

@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from ntop.conventions import DataError
-from ntop.geometry.cameras import Camera, Equidistant, Lens
+from ntop.geometry.cameras import Camera, Lens
 from ntop.geometry.rotations import cross_matrix, matrix_from_axis_angle
 from ntop.geometry.triangulation import Triangulation, camera_centers, triangulate
 
@@ -53,7 +53,7 @@ class Observations:
 
 def pixels_per_radian(lens: Lens) -> float:
     """Scale of a lens on its axis."""
-    return lens.focal if isinstance(lens, Equidistant) else 0.5 * (lens.fx + lens.fy)
+    return 0.5 * (lens.fx + lens.fy)
 
 
 def observe(

@@ -6,7 +6,7 @@ turns into that centre; read literally it mirrors E and W (decision 0005).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -61,8 +61,3 @@ def top_view_cameras(
         offset[2] = rig.height_above_pelvis_m
         cameras[view] = Camera(rig.lens(), pelvis + offset, rotation)
     return cameras
-
-
-def cropped(lens: Equidistant, *, left: int, top: int, width: int, height: int) -> Equidistant:
-    """The same lens seen through a window of whole pixels."""
-    return replace(lens, cx=lens.cx - left, cy=lens.cy - top, width=width, height=height)

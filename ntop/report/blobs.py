@@ -15,7 +15,8 @@ from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, occup
 from ntop.field.kernels.tables import VOID_RAW
 from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
 from ntop.field.warp import identity_warp, occupied, octant_radius_m
-from ntop.geometry.cameras import Camera, Equidistant
+from ntop.geometry.cameras import Camera
+from ntop.geometry.windows import cropped, resized
 from ntop.report.inputs import Dataset
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import fisheye_camera
@@ -106,19 +107,11 @@ def _close_up(
     center = torch.from_numpy(center_world)
     pixel, _ = camera.project(center)
     distance = float((center - camera.center_world).norm())
-    # a circle's image is stretched by theta / sin(theta) <= max_theta / sin(max_theta)
-    stretch = max(1.0, lens.max_theta / max(np.sin(lens.max_theta), 0.1))
-    radius = lens.focal * stretch * (RADIUS_M + MARGIN_M) / distance + 1
+    radius = lens.max_px_per_rad * (RADIUS_M + MARGIN_M) / distance + 1
     left, top = np.floor(pixel.numpy() - radius).astype(int).tolist()
     side = int(np.ceil(2 * radius)) + 1
-    fine = Equidistant(
-        focal=lens.focal * RAYS_PER_SIDE,
-        cx=(lens.cx - left) * RAYS_PER_SIDE,
-        cy=(lens.cy - top) * RAYS_PER_SIDE,
-        width=side * RAYS_PER_SIDE,
-        height=side * RAYS_PER_SIDE,
-        max_theta=lens.max_theta,
-    )
+    window = cropped(lens, left=left, top=top, width=side, height=side)
+    fine = resized(window, width=side * RAYS_PER_SIDE, height=side * RAYS_PER_SIDE)
     return np.array([left, top], dtype=float), replace(camera, lens=fine)
 
 

@@ -3,7 +3,8 @@ import math
 import torch
 
 from ntop.conventions import VIEWS
-from ntop.geometry.rigs import Rig, cropped, top_view_cameras
+from ntop.geometry.rigs import Rig, top_view_cameras
+from ntop.geometry.windows import cropped
 
 RIG = Rig(1.2, 1.0, 1000, 1000, 1000 / math.pi)
 PELVIS = torch.tensor([0.7, -1.3, 0.95], dtype=torch.float64)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose
-from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE
+from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE, ConfigError, DataError
 from ntop.field.avatar import Avatar
 from ntop.field.canonical import (
     CanonicalGrid,
@@ -56,6 +56,19 @@ class RenderSettings:
     crop: bool = True
     edge_rays: int = 4
     phase: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse steps that never reach the end of a ray, and lights that cannot be left.
+
+        Raises:
+            ConfigError: `step_m` or `stop_transmittance` is out of range.
+        """
+        if not 0 < self.step_m < math.inf:
+            raise ConfigError(f"render step_m is {self.step_m} m, expected a positive length")
+        if not 0 <= self.stop_transmittance < 1:
+            raise ConfigError(
+                f"render stop_transmittance is {self.stop_transmittance}, expected 0 <= it < 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -140,9 +153,14 @@ def trace_rays(
     *,
     settings: RenderSettings,
 ) -> RayRendering:
-    """Rays from one point, in any directions (unit length)."""
+    """Rays from one point, in any directions; their length says nothing.
+
+    Raises:
+        DataError: a direction or the centre is no number, or the avatar's values are none.
+    """
     count = len(directions_world)
     origin = center_world.double().numpy() - posed.warp.origin_world
+    directions = unit_directions(origin, directions_world.double().numpy())
     colours = np.empty((count, 3), np.float32)
     opacity = np.empty(count, np.float32)
     depth = np.empty(count, np.float32)
@@ -151,11 +169,32 @@ def trace_rays(
     render_rays(
         posed.grid.tables(), posed.warp.tables, posed.light, posed.labels.values,
         posed.labels.origin, 1 / posed.labels.spacing_m, np.zeros(1, np.int64), origin[None],
-        np.ascontiguousarray(directions_world.numpy(), np.float64),
-        np.full(count, settings.phase), settings.step_m, settings.stop_transmittance,
+        directions, np.full(count, settings.phase), settings.step_m, settings.stop_transmittance,
         settings.colour_floor, colours, opacity, depth, parts, evaluations,
     )  # fmt: skip
+    if not (np.isfinite(colours).all() and np.isfinite(opacity).all()):
+        raise DataError(
+            "rendered pixels are not finite: the avatar holds NaN or infinity; train it again"
+        )
     return RayRendering(colours, opacity, depth, parts, int(evaluations.sum()))
+
+
+def unit_directions(
+    origin: Float[np.ndarray, " 3"], directions: Float[np.ndarray, "ray 3"]
+) -> Float[np.ndarray, "ray 3"]:
+    """Directions of length one, contiguous: the march measures optical depth in metres.
+
+    Raises:
+        DataError: one has no direction (zero, NaN or infinite), or the origin is not finite.
+    """
+    length = np.sqrt((directions**2).sum(1, keepdims=True))
+    usable = np.isfinite(length) & (length > 0)
+    if not (usable.all() and np.isfinite(origin).all()):
+        raise DataError(
+            f"{int((~usable).sum())} of {len(directions)} rays have no direction (zero, NaN or "
+            f"infinite), from {origin.tolist()}: check the camera's lens and pose"
+        )
+    return np.ascontiguousarray(directions / length)
 
 
 def render_view(

@@ -32,7 +32,8 @@ class Margins:
         assert caught, f"{what}: the mutant's {measured:.3g} {unit} passes the limit {limit:.3g}"
 
     def _keep(self, relation: str, what: str, measured: float, limit: float, unit: str) -> None:
-        kept = {"what": what, "measured": measured, "relation": relation, "limit": limit}
+        values = {"measured": float(measured), "limit": float(limit)}
+        kept = {"what": what, "relation": relation, **values}
         self._record("margin", json.dumps({**kept, "unit": unit}))
 
 

@@ -6,9 +6,11 @@ import numba
 import numpy as np
 
 from ntop.field.kernels import device, kernel
-from ntop.field.kernels.march import densest_sheet
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
+    VOID_RAW,
+    canonical_point,
+    grid_corners,
     interpolate,
     shade,
     sigmoid,
@@ -37,9 +39,7 @@ def occupied_cell(warp, pose, x, y, z, state):
 
 
 @kernel
-def paper_rays(
-    grid, warp, light, origin, directions, near, step, shift, samples, colours, opacity
-):
+def paper_rays(grid, warp, light, origin, directions, near, step, shift, samples, colours, opacity):
     """Composite samples near + (k + shift) * step, k < samples, of each ray as HumanNeRF does.
 
     Args:
@@ -69,7 +69,14 @@ def paper_rays(
                 )
                 if cell < 0:
                     continue
-                raw, sheet = densest_sheet(grid, warp, cell, state, rows, weights)
+                raw, sheet = VOID_RAW, -1
+                for claim in range(2):
+                    if warp.sheets[cell, claim, 0] >= 0:
+                        x, y, z = canonical_point(warp, cell, claim, state[1], state[2], state[3])
+                        if grid_corners(grid, x, y, z, rows[claim], weights[claim]):
+                            found = interpolate(grid, 0, rows[claim], weights[claim])
+                            if found > raw:
+                                raw, sheet = found, claim
                 if sheet < 0:
                     continue
                 delta = step[r] if k < samples - 1 else LAST_DELTA_M
@@ -77,8 +84,6 @@ def paper_rays(
                 x, y, z = surface_normal(warp, cell, sheet, state[1], state[2], state[3])
                 for channel in range(3):
                     albedo = sigmoid(interpolate(grid, 1 + channel, rows[sheet], weights[sheet]))
-                    colours[r, channel] += (
-                        passing * alpha * albedo * shade(light, channel, x, y, z)
-                    )
+                    colours[r, channel] += passing * alpha * albedo * shade(light, channel, x, y, z)
                 opacity[r] += passing * alpha
                 passing *= 1 - alpha + TRANSMITTANCE_FLOOR

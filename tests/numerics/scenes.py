@@ -1,0 +1,88 @@
+"""Analytic fields behind the avatar's own interface: grids of given values, identity warps."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, void_values
+from ntop.field.kernels.tables import DENSITY_SCALE
+from ntop.field.rendering import PosedAvatar
+from ntop.field.warp import PoseWarp, identity_warp
+
+Profile = Callable[[np.ndarray], np.ndarray]
+EXACT = {"stop_transmittance": 0.0, "colour_floor": 0.0, "edge_rays": 1}  # no shortcut
+
+
+def density_of(raw: np.ndarray) -> np.ndarray:
+    """The field's law: density (1/m) of raw values."""
+    return DENSITY_SCALE * np.logaddexp(0.0, raw)
+
+
+def raw_of(density: np.ndarray) -> np.ndarray:
+    """The law's inverse; vanishing densities become those of the void."""
+    return np.log(np.maximum(np.expm1(density / DENSITY_SCALE), 1e-12))
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
+
+
+def opened(warp: PoseWarp) -> PoseWarp:
+    """The same warp with every octant occupied."""
+    tables = warp.tables
+    full = tables._replace(
+        occupancy=np.full_like(tables.occupancy, 255), blocks=np.ones_like(tables.blocks)
+    )
+    return PoseWarp(full, warp.origin_world, warp.cell_m)
+
+
+def grid_of(
+    raw: Profile, *, size_m: tuple[float, float, float], voxel_m: float, colour: Profile | None
+) -> CanonicalGrid:
+    """Nodes over [0, size_m] with raw densities and raw colours of their positions (metres)."""
+    shape = [int(np.ceil((s / voxel_m + 1) / 4 - 1e-9)) for s in size_m]
+    bricks, positions = number_bricks(np.ones(shape, bool))
+    within = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    nodes = (4 * positions[1:, None] + within).reshape(-1, 3) * voxel_m
+    values = void_values(len(positions))
+    values[64:, 0] = raw(nodes)
+    values[64:, 1:] = colour(nodes) if colour else 0.0
+    return CanonicalGrid(values, bricks, positions, np.zeros(3), voxel_m)
+
+
+def posed_field(
+    raw: Profile,
+    *,
+    size_m: tuple[float, float, float],
+    voxel_m: float,
+    colour: Profile | None = None,
+    low_world: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> PosedAvatar:
+    """A field in the box [low_world, low_world + size_m]; profiles take box coordinates."""
+    low = np.array(low_world)
+    warp = opened(identity_warp(low, low + np.array(size_m), cell_m=max(size_m) / 20))
+    light = np.zeros((9, 3), np.float32)
+    light[0] = 1
+    labels = PartLabels(np.ones((1, 1, 1), np.uint8), np.zeros(3), 1.0)
+    grid = grid_of(raw, size_m=size_m, voxel_m=voxel_m, colour=colour)
+    return PosedAvatar(grid=grid, warp=warp, light=light, labels=labels)
+
+
+def cone(target: np.ndarray, *, distance_m: float, spread_m: float, count: int, seed: int = 0):
+    """A point before the target (along z) and unit directions to points scattered around it."""
+    scatter = np.random.default_rng(seed).uniform(-spread_m, spread_m, (count, 2))
+    centre = target - [0, 0, distance_m]
+    aims = target + np.concatenate([scatter, np.zeros((count, 1))], 1)
+    away = aims - centre
+    directions = away / np.linalg.norm(away, axis=1, keepdims=True)
+    return torch.from_numpy(centre), torch.from_numpy(directions)
+
+
+def order(errors: list[float]) -> float:
+    """Order of convergence from errors at steps that halve: the slope of the logarithms."""
+    return float(-np.polyfit(np.arange(len(errors)), np.log2(errors), 1)[0])
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

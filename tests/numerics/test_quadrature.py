@@ -1,0 +1,453 @@
+"""Cases 15 and 17 to 24 and 28: from densities along a ray to a colour."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import ndtr
+
+from ntop.conventions import ConfigError, DataError
+from ntop.field import rendering, twin
+from ntop.field.rendering import RenderSettings, trace_rays
+from tests.numerics.scenes import (
+    EXACT,
+    cone,
+    density_of,
+    order,
+    posed_field,
+    raw_of,
+    rms,
+    sigmoid,
+)
+
+DEFAULT_STEP_M = RenderSettings().step_m
+
+
+def exact(step_m, **changes):
+    return RenderSettings(step_m=step_m, **(EXACT | changes))
+
+
+def composed(tau, colour, dtype=torch.float64):
+    """The specification's compositing of numpy arrays (rays, samples[, 3])."""
+    return twin.composite(torch.from_numpy(tau).to(dtype), torch.from_numpy(colour).to(dtype))
+
+
+def humannerf(tau, colour, dtype):
+    """The compositing of HumanNeRF: 1 - exp, product of 1 - alpha + 1e-10."""
+    alpha = 1 - torch.exp(-torch.from_numpy(tau).to(dtype))
+    passing = torch.cumprod(1 - alpha + 1e-10, -1).roll(1, -1)
+    passing[..., 0] = 1
+    return ((alpha * passing)[..., None] * torch.from_numpy(colour).to(dtype)).sum(-2)
+
+
+def ramp_ball():
+    """A ball of radius 5 cm in a 16 cm box, opaque in its middle, its colour varying."""
+    middle = np.full(3, 0.08)
+    return posed_field(
+        lambda p: 120 * (0.05 - np.linalg.norm(p - middle, axis=1)),
+        size_m=(0.16, 0.16, 0.16),
+        voxel_m=0.008,
+        colour=lambda p: 30 * (p - middle),
+    )
+
+
+def ball_rays(count=400):
+    return cone(np.full(3, 0.08), distance_m=0.7, spread_m=0.06, count=count)
+
+
+def test_15_scaling_a_direction_changes_nothing(margin, monkeypatch):
+    posed = ramp_ball()
+    centre, directions = ball_rays()
+    settings = exact(DEFAULT_STEP_M)
+    unit = trace_rays(posed, centre, directions, settings=settings)
+    assert unit.alpha.max() > 0.99
+    for scale in (1e-3, 318.0, 1e3):
+        scaled = trace_rays(posed, centre, scale * directions, settings=settings)
+        margin.at_most("rgb", np.abs(scaled.rgb - unit.rgb).max(), 1e-5)
+        margin.at_most("alpha", np.abs(scaled.alpha - unit.alpha).max(), 1e-5)
+        margin.at_most("depth", np.abs(scaled.depth_m - unit.depth_m).max(), 1e-5, "m")
+    # the mutant marches along whatever it is given
+    monkeypatch.setattr(rendering, "unit_directions", lambda _, given: np.ascontiguousarray(given))
+    mutant = trace_rays(posed, centre, 318.0 * directions, settings=settings)
+    margin.mutant_exceeds("rgb, abs(d) ignored", np.abs(mutant.rgb - unit.rgb).max(), 1e-5)
+
+
+def test_17_a_homogeneous_sphere_has_the_opacity_of_its_chord(margin):
+    density, radius = 31.0, 0.05
+    generator = np.random.default_rng(0)
+    impact = radius * generator.random(500)
+    chord = 2 * np.sqrt(radius**2 - impact**2)
+    truth = -np.expm1(-density * chord)
+    for samples in (1, 7, 512):
+        tau = np.repeat((density * chord / samples)[:, None], samples, 1)
+        clipped = composed(tau, np.ones((*tau.shape, 3)), torch.float32)
+        margin.at_most(
+            "clipped, fp32", np.abs(clipped.opacity.double().numpy() - truth).max(), 1e-6
+        )
+    # the mutant closes the last interval at 1e10 m, as HumanNeRF does
+    tau = np.repeat((density * chord / 64)[:, None], 64, 1)
+    tau[:, -1] = density * 1e10
+    endless = composed(tau, np.ones((*tau.shape, 3))).opacity.numpy()
+    margin.mutant_exceeds("last interval 1e10 long", np.abs(endless - truth).max(), 1e-6)
+    # unclipped: the same ball as a jump between two nodes, which steps do not resolve
+    middle = np.full(3, 0.06)
+    posed = posed_field(
+        lambda p: np.where(
+            np.linalg.norm(p - middle, axis=1) < radius, raw_of(np.array(density)), -12.0
+        ),
+        size_m=(0.12, 0.12, 0.12),
+        voxel_m=0.001,
+    )
+    centre, directions = cone(middle, distance_m=0.7, spread_m=0.05, count=2000)
+    fine = trace_rays(posed, centre, directions, settings=exact(0.00025)).alpha
+    errors = [
+        rms(trace_rays(posed, centre, directions, settings=exact(step)).alpha - fine)
+        for step in (0.016, 0.008, 0.004)
+    ]
+    margin.at_least("unclipped, order", order(errors), 0.9)
+
+
+WIDTH_M, BLOB_DEPTH = 0.04, 2.0  # a Gaussian blob and its optical depth through the middle
+
+
+def blob_scene():
+    """A thin column through a Gaussian blob; its colour changes along the way."""
+    size = (0.024, 0.024, 0.424)
+    middle = np.array(size) / 2
+    peak = BLOB_DEPTH / (WIDTH_M * math.sqrt(2 * math.pi))
+
+    def raw(points):
+        squared = ((points - middle) ** 2).sum(1)
+        return raw_of(peak * np.exp(-squared / (2 * WIDTH_M**2)))
+
+    posed = posed_field(
+        raw, size_m=size, voxel_m=0.001, colour=lambda p: np.repeat(20 * (p - middle)[:, 2:], 3, 1)
+    )
+    return posed, middle, peak
+
+
+def blob_truth(directions, *, distance_m, peak):
+    """Opacity in closed form; colour as the blob's own integral over its optical depth."""
+    closest = distance_m * directions[:, 2]  # length to the point nearest the middle
+    impact2 = distance_m**2 - closest**2
+    total = BLOB_DEPTH * np.exp(-impact2 / (2 * WIDTH_M**2))
+    t = np.linspace(-5.3 * WIDTH_M, 5.3 * WIDTH_M, 8001)
+    density = peak * np.exp(-(t**2 + impact2[:, None]) / (2 * WIDTH_M**2))
+    before = total[:, None] * ndtr(t / WIDTH_M)
+    colour = sigmoid(20 * ((closest[:, None] + t) * directions[:, 2:] - distance_m))
+    seen = np.trapezoid(np.exp(-before) * density * colour, t, axis=1)
+    return -np.expm1(-total), seen
+
+
+def test_18_a_gaussian_blob_converges_with_the_second_order(margin):
+    posed, middle, peak = blob_scene()
+    distance = 0.9
+    centre, directions = cone(middle, distance_m=distance, spread_m=0.008, count=300)
+    alpha, colour = blob_truth(directions.numpy(), distance_m=distance, peak=peak)
+    seen = trace_rays(posed, centre, directions, settings=exact(DEFAULT_STEP_M))
+    margin.at_most("alpha at the default step", np.abs(seen.alpha - alpha).max(), 1e-4)
+    margin.at_most("colour at the default step", np.abs(seen.rgb[:, 0] - colour).max(), 1e-4)
+    fine = trace_rays(posed, centre, directions, settings=exact(0.0005)).rgb
+    errors = [
+        rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb - fine)
+        for step in (0.032, 0.016, 0.008)
+    ]
+    margin.at_least("order of the rule", order(errors), 1.9)
+
+
+def slab_rule(rule, samples, *, start=0.0):
+    """Rms colour error of a rule on a soft slab over 60 phases, compositing as specified.
+
+    The slab (200/m) begins softly within a centimetre, a metre into a 2 m ray.
+    """
+    length = 2.0
+    h = (length - start) / samples
+    surface = 1 + h * (np.arange(60) / 60)[:, None]
+
+    def density(t):
+        return 200 * ndtr((t - surface) / 0.01)
+
+    def colour(t):
+        return np.repeat(sigmoid(30 * (t - surface))[..., None], 3, -1)
+
+    t = start + h * np.arange(samples)[None]
+    middle = t + h / 2
+    if rule == "left":
+        tau, at = h * density(t), t
+    elif rule == "middle":
+        tau, at = h * density(middle), middle
+    else:
+        gauss = h / (2 * math.sqrt(3))
+        tau, at = h / 2 * (density(middle - gauss) + density(middle + gauss)), middle
+    seen = composed(tau, colour(np.broadcast_to(at, (60, samples))))
+    return seen.rgb.numpy(), surface
+
+
+def slab_errors(rule, counts, *, start=0.0):
+    found = []
+    for count in counts:
+        # the truth belongs to the same phases: surfaces follow the coarse step
+        fine, _ = slab_truth(count, start)
+        found.append(rms(slab_rule(rule, count, start=start)[0] - fine))
+    return found
+
+
+def slab_truth(count, start, samples=16384):
+    length = 2.0
+    surface = 1 + (length - start) / count * (np.arange(60) / 60)[:, None]
+    h = (length - start) / samples
+    t = start + h * (np.arange(samples) + 0.5)[None]
+    tau = 200 * ndtr((t - surface) / 0.01) * h
+    colour = np.repeat(sigmoid(30 * (t - surface))[..., None], 3, -1)
+    return composed(tau, colour).rgb.numpy(), surface
+
+
+def test_19_a_soft_slab_converges_and_two_densities_beat_one(margin):
+    counts = (128, 256, 512)
+    left, middle = slab_errors("left", counts), slab_errors("middle", counts)
+    gauss = slab_errors("gauss", counts)
+    margin.at_least("order, midpoint", order(middle), 1.9)
+    margin.at_least("left over Gauss-2 at N=128", left[0] / gauss[0], 5)
+    # a ray that starts inside the slab has an end that does not vanish: left falls to order one
+    inside = slab_errors("left", counts, start=1.02)
+    margin.at_least(
+        "order from inside, midpoint", order(slab_errors("middle", counts, start=1.02)), 1.9
+    )
+    margin.mutant_exceeds("2 - order of the left rule from inside", 2 - order(inside), 0.1)
+
+    # the renderer's own rule, on a slab behind its interface
+    size = (0.06, 0.06, 0.12)
+    depth = np.arange(0, 0.1241, 0.002)
+
+    def raw(z):
+        return raw_of(200 * ndtr((z - 0.05) / 0.01))
+
+    posed = posed_field(
+        lambda p: raw(p[:, 2]), size_m=size, voxel_m=0.002,
+        colour=lambda p: np.repeat(30 * (p[:, 2:] - 0.05), 3, 1),
+    )  # fmt: skip
+    distance = 0.8
+    centre, directions = cone(
+        np.array([0.03, 0.03, 0.05]), distance_m=distance, spread_m=0.02, count=200
+    )
+    z = np.linspace(0, 0.12, 24001)
+    slope = directions.numpy()[:, 2:]
+    tau = density_of(np.interp(z, depth, raw(depth))) / slope
+    before = np.concatenate(
+        [np.zeros((len(slope), 1)), np.cumsum((tau[:, 1:] + tau[:, :-1]) / 2 * z[1], 1)], 1
+    )
+    truth = np.trapezoid(np.exp(-before) * tau * sigmoid(30 * (z - 0.05)), z, axis=1)
+    errors = [
+        rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb[:, 0] - truth)
+        for step in (0.016, 0.008, 0.004)
+    ]
+    margin.at_least("order of the renderer", order(errors), 1.9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_20_weights_and_passing_light_share_out_the_whole(margin, dtype):
+    generator = np.random.default_rng(1)
+    for samples in (1, 64, 1024):
+        tau = 10 ** generator.uniform(-5, 1.5, (500, samples))
+        colour = generator.random((500, samples, 3))
+        seen = composed(tau, colour, dtype)
+        white = composed(tau, np.ones((500, samples, 3)), dtype)
+        limit = 4 * torch.finfo(dtype).eps * math.sqrt(samples)
+        whole = white.rgb[:, 0] + white.transmittance - 1
+        margin.at_most(f"sum of weights + T - 1, N={samples}", float(whole.abs().max()), limit)
+        if dtype == torch.float64:
+            passing = torch.prod(torch.exp(-torch.from_numpy(tau)) + 1e-10, -1)
+            biased = humannerf(tau, np.ones((500, samples, 3)), dtype)[:, 0] + passing - 1
+            margin.mutant_exceeds(
+                f"1 - alpha + 1e-10, N={samples}", float(biased.abs().max()), limit
+            )
+        assert ((seen.opacity >= 0) & (seen.opacity <= 1)).all()
+        low, high = (torch.from_numpy(f(colour, axis=1)) for f in (np.min, np.max))
+        share = seen.rgb.double() / white.rgb.double()
+        assert (share >= low - 1e-6).all() and (share <= high + 1e-6).all()
+
+
+def test_20_rendered_white_is_its_own_opacity(margin):
+    posed = posed_field(
+        lambda p: 800 * (0.05 - np.linalg.norm(p - 0.06, axis=1)),
+        size_m=(0.12, 0.12, 0.12), voxel_m=0.006, colour=lambda p: np.full((len(p), 3), 40.0),
+    )  # fmt: skip
+    centre, directions = cone(np.full(3, 0.06), distance_m=0.7, spread_m=0.06, count=1000)
+    seen = trace_rays(posed, centre, directions, settings=exact(DEFAULT_STEP_M))
+    assert seen.alpha.min() == 0 and 0.99 < seen.alpha.max() <= 1
+    margin.at_most("rgb - alpha of white", np.abs(seen.rgb - seen.alpha[:, None]).max(), 1e-6)
+
+
+def mist(samples, generator, low=0.01, high=5.0):
+    """Rays whose whole optical depth lies between `low` and `high`, in random pieces."""
+    total = np.geomspace(low, high, 512)[:, None]
+    share = generator.random((512, samples))
+    return total * share / share.sum(1, keepdims=True), generator.random((512, samples, 3))
+
+
+def test_21_single_precision_loses_nothing_that_is_seen(margin):
+    generator = np.random.default_rng(2)
+    scenes = {
+        "mist": mist(1024, generator),
+        "opaque": (60 * generator.random((512, 128)) ** 8, generator.random((512, 128, 3))),
+        "thin": (np.full((512, 1024), 1e-4), generator.random((512, 1024, 3))),
+    }
+    for name, (tau, colour) in scenes.items():
+        truth = composed(tau, colour).rgb
+        single = composed(tau, colour, torch.float32).rgb.double()
+        limit = 1e-7 if name == "thin" else 5e-7
+        margin.at_most(f"{name}, fp32", float((single - truth).abs().max()), limit)
+        halves = [a.astype(np.float16).astype(np.float64) for a in (tau, colour)]
+        stored = composed(*halves, torch.float32).rgb.double()
+        margin.at_most(f"{name}, stored in fp16", float((stored - truth).abs().max()), 3e-4)
+        mutant = humannerf(tau, colour, torch.float32).double()
+        if name != "opaque":
+            margin.mutant_exceeds(
+                f"{name}, 1 - exp and 1e-10", float((mutant - truth).abs().max()), limit
+            )
+    # the renderer: a thin homogeneous mist, a thousand steps long
+    density = 0.2
+    posed = posed_field(
+        lambda p: np.full(len(p), raw_of(np.array(density))),
+        size_m=(0.06, 0.06, 0.6), voxel_m=0.012, colour=lambda p: np.full((len(p), 3), 40.0),
+    )  # fmt: skip
+    seen = trace_rays(
+        posed,
+        torch.tensor([0.03, 0.03, -0.1], dtype=torch.float64),
+        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
+        settings=exact(0.0005),
+    )
+    margin.at_most("rendered mist", abs(seen.rgb[0, 0] - seen.alpha[0]), 1e-7)
+
+
+@pytest.mark.parametrize("value", [math.inf, 1e30, -math.inf, -1e30, math.nan])
+def test_22_broken_densities_never_make_nan_pixels(value):
+    def raw(points):
+        values = 100 * (0.05 - np.linalg.norm(points - 0.06, axis=1))
+        values[:: len(values) // 7] = value
+        return values
+
+    posed = posed_field(raw, size_m=(0.12, 0.12, 0.12), voxel_m=0.006)
+    centre, directions = cone(np.full(3, 0.06), distance_m=0.7, spread_m=0.06, count=500)
+    for stop in (0.0, 1e-3):
+        try:
+            seen = trace_rays(
+                posed, centre, directions, settings=exact(0.003, stop_transmittance=stop)
+            )
+        except DataError as error:
+            assert "finite" in str(error)
+            continue
+        for part in (seen.rgb, seen.alpha, seen.depth_m):
+            assert np.isfinite(part).all()
+        assert ((seen.alpha >= 0) & (seen.alpha <= 1)).all()
+    # compositing itself: an infinite depth is opaque, whatever lies behind it
+    tau = np.array([[0.3, 1e30, 0.2], [math.inf, 1.0, math.inf], [0.0, 0.0, 0.0]])
+    seen = composed(tau, np.ones((3, 3, 3)))
+    assert torch.isfinite(seen.rgb).all()
+    assert seen.opacity.tolist() == [1.0, 1.0, 0.0]
+
+
+def test_22_broken_colours_are_an_error():
+    posed = posed_field(
+        lambda p: np.full(len(p), 2.0), size_m=(0.06, 0.06, 0.06), voxel_m=0.006,
+        colour=lambda p: np.full((len(p), 3), math.nan),
+    )  # fmt: skip
+    centre, directions = cone(np.full(3, 0.03), distance_m=0.7, spread_m=0.02, count=10)
+    with pytest.raises(DataError, match="finite"):
+        trace_rays(posed, centre, directions, settings=exact(0.003))
+
+
+@pytest.mark.parametrize("step", [0.0, -0.003, math.nan, math.inf])
+def test_22_a_step_that_is_none_is_refused(step):
+    with pytest.raises(ConfigError, match="step_m"):
+        RenderSettings(step_m=step)
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 0.0], [math.nan, 0.0, 1.0], [math.inf, 0.0, 1.0]])
+def test_22_directions_that_point_nowhere_are_refused(direction):
+    posed = ramp_ball()
+    directions = torch.tensor([[0.0, 0.0, 1.0], direction], dtype=torch.float64)
+    with pytest.raises(DataError, match="direction"):
+        trace_rays(posed, torch.zeros(3), directions, settings=exact(0.003))
+
+
+def test_22_rays_without_samples_see_nothing():
+    posed = ramp_ball()
+    middle = torch.full((3,), 0.08, dtype=torch.float64)
+    away = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    # the box lies behind: its interval is reversed
+    behind = trace_rays(posed, middle + 2 * away, away[None], settings=exact(0.003))
+    assert behind.alpha.tolist() == [0.0] and behind.evaluations == 0
+    none = trace_rays(posed, middle, torch.zeros(0, 3), settings=exact(0.003))
+    assert none.rgb.shape == (0, 3)
+    # N = 1: a step longer than the box
+    one = trace_rays(posed, middle + 0.5 * away, -away[None], settings=exact(1.0))
+    assert np.isfinite(one.rgb).all() and 0 <= one.alpha[0] <= 1
+
+
+@pytest.mark.parametrize("stop", [1e-4, 1e-3, 1e-2])
+def test_23_stopping_early_costs_no_more_than_the_light_left(margin, stop):
+    posed = ramp_ball()
+    centre, directions = ball_rays(4000)
+    whole = trace_rays(posed, centre, directions, settings=exact(0.002))
+    stopped = trace_rays(posed, centre, directions, settings=exact(0.002, stop_transmittance=stop))
+    assert stopped.evaluations < whole.evaluations
+    seen = whole.alpha > 0.02
+    # over mid-grey: what was not marched is filled with the background
+    on_grey = [rays.rgb + 0.5 * (1 - rays.alpha[:, None]) for rays in (stopped, whole)]
+    difference = np.abs(on_grey[0] - on_grey[1]).max(1)[seen]
+    margin.at_most(f"stop {stop:g}: pixel / bound", difference.max() / stop, 1 + 1e-3)
+    margin.at_most(f"stop {stop:g}: mean / bound", difference.mean() / stop, 0.4)
+
+
+def test_24_neither_order_nor_company_changes_a_ray():
+    posed = ramp_ball()
+    centre, directions = ball_rays(1000)
+    settings = RenderSettings()
+    whole = trace_rays(posed, centre, directions, settings=settings)
+    shuffled = torch.from_numpy(np.random.default_rng(3).permutation(1000))
+    moved = trace_rays(posed, centre, directions[shuffled], settings=settings)
+    few = trace_rays(posed, centre, directions[400:537], settings=settings)
+    again = trace_rays(posed, centre, directions, settings=settings)
+    for name in ("rgb", "alpha", "depth_m", "parts"):
+        first = getattr(whole, name)
+        assert getattr(moved, name).tobytes() == first[shuffled.numpy()].tobytes(), name
+        assert getattr(few, name).tobytes() == first[400:537].tobytes(), name
+        assert getattr(again, name).tobytes() == first.tobytes(), name
+
+
+def test_28_compositing_has_right_and_finite_gradients(margin):
+    generator = torch.Generator().manual_seed(4)
+    raw = 4 * torch.randn(5, 7, 4, generator=generator, dtype=torch.float64)
+    normals = torch.nn.functional.normalize(
+        torch.randn(5, 7, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+    light = torch.zeros(9, 3, dtype=torch.float64)
+    light[0] = 1
+
+    def seen(values):
+        found = twin.seen_rays(values, normals, light, step_m=0.003)
+        return found.rgb, found.opacity, found.transmittance
+
+    assert torch.autograd.gradcheck(seen, (raw.requires_grad_(),))
+    for dtype in (torch.float32, torch.float64):
+        extreme = torch.linspace(-50, 90, 57, dtype=dtype)
+        for alpha in (0.0, 1.0):  # of what lies before: nothing, or a wall
+            wall = torch.full((57, 1, 4), 90.0 if alpha else -50.0, dtype=dtype)
+            values = torch.cat([wall, extreme[:, None, None].expand(57, 1, 4)], 1)
+            values = values.clone().requires_grad_()
+            found = twin.seen_rays(
+                values, normals[:1, :2].to(dtype).expand(57, 2, 3), light.to(dtype), step_m=0.003
+            )
+            for part in (found.rgb, found.opacity, found.transmittance):
+                assert torch.isfinite(part).all()
+            (found.rgb.sum() + found.opacity.sum()).backward()
+            margin.at_most(
+                f"gradients that are not finite, {dtype}",
+                int((~torch.isfinite(values.grad)).sum()), 0,
+            )  # fmt: skip
+    # the mutant: an infinite density times the zero length of a padded sample
+    padded = torch.tensor([90.0], dtype=torch.float16, requires_grad=True)
+    (torch.exp(padded) * torch.zeros(1, dtype=torch.float16)).backward()
+    margin.mutant_exceeds("inf * 0", float(padded.grad), 0)

@@ -11,6 +11,7 @@ from ntop.config.sources import QualisysSource, StudioSource
 from ntop.conventions import DataError
 from ntop.stages import VERSIONS
 from ntop.storage.atomic import publish_folder
+from ntop.storage.files import check_files, record_files
 from ntop.storage.provenance import file_sha256, provenance, write_provenance
 
 STAGE = "capture"
@@ -37,6 +38,7 @@ def main(config: CaptureConfig, source: str, actor: str, packages: Path, out: Pa
     try:
         match config.source_section:
             case QualisysSource() as settings:
+                check_files(packages / settings.package)
                 capture_qualisys(
                     settings,
                     source=source,
@@ -55,6 +57,7 @@ def main(config: CaptureConfig, source: str, actor: str, packages: Path, out: Pa
             inputs=_inputs(config, packages=packages, work=work),
         )
         write_provenance(record, folder=work)
+        record_files(work)
         publish_folder(work, out)
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -40,6 +40,7 @@ from ntop.masks.segmentation import (
 from ntop.masks.tracking import Networks, Sighting, follow_person
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder
+from ntop.storage.files import check_files, record_files
 from ntop.storage.frames import iterate_frames
 from ntop.storage.images import read_matte, write_matte
 from ntop.storage.tables import Row, read_table, write_table
@@ -85,8 +86,11 @@ def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
         DataError: unreadable frames or networks, a hand-corrected mask of another size than its
             frame, or not one frame of the actor with a usable mask, or with keypoints.
     """
+    networks = (config.detector, config.landmarks)
+    check_files(capture, *(packages / Path(name).parts[0] for name in networks))
     with atomic_folder(out) as folder:
         segment_capture(Job(config, capture, packages, folder))
+        record_files(folder)
 
 
 def segment_capture(job: Job) -> None:

@@ -39,6 +39,7 @@ from ntop.storage import schemas
 from ntop.storage.atomic import publish_folder, write_bytes
 from ntop.storage.bodies import body_rows
 from ntop.storage.cameras import write_cameras
+from ntop.storage.files import check_files, record_files
 from ntop.storage.images import read_matte
 from ntop.storage.provenance import file_sha256, provenance, write_provenance
 from ntop.storage.recordings import read_recordings
@@ -61,6 +62,7 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
             person.
     """
     torch.set_num_threads(1)  # sums in one order: the same bytes whatever the machine
+    check_files(capture, keypoints.parent, masks.parent)
     inputs = {
         "frames": capture / "frames.parquet",
         "cameras": capture / "cameras.parquet",
@@ -209,6 +211,7 @@ def _publish(
             inputs={name: file_sha256(path) for name, path in inputs.items()},
         )
         write_provenance(record, folder=work)
+        record_files(work)
         publish_folder(work, out)
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -25,6 +25,7 @@ from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
+from ntop.storage.files import check_files, record_files
 from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
 from ntop.storage.tables import write_table
 from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, work_folder
@@ -54,6 +55,7 @@ def main(
         SystemExit: with code 143 after SIGTERM; the same command then continues.
     """
     torch.set_num_threads(1)  # the kernels have their own threads
+    check_files(capture, cameras.parent, masks.parent, bodies.parent)
     tables = Tables(capture / "frames.parquet", cameras, masks, bodies)
     inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
     values = config.model_dump(mode="json")
@@ -88,6 +90,7 @@ def main(
             write_table(rows, schema=schemas.CURVE, path=folder / "curve.parquet")
             record = provenance(stage=STAGE, version=VERSIONS[STAGE], config=values, inputs=inputs)
             write_provenance(record, folder=folder)
+            record_files(folder)
         clear_work(work)
 
 

@@ -6,6 +6,7 @@ in the work folder by one rename, so that a stopped job goes on at its first unf
 
 import json
 import math
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.bodies import body_pose_from_rows, read_bodies
+from ntop.storage.files import check_files, find_damage, read_records, record_files
 from ntop.storage.images import write_depth, write_parts, write_rgba
 from ntop.storage.keys import SetKey
 from ntop.storage.links import link_or_copy
@@ -69,6 +71,8 @@ def main(
         SystemExit: with code 143 after SIGTERM; the same command then continues.
     """
     torch.set_num_threads(1)  # posing is small; the kernels have their own threads
+    check_files(avatar, packages / CLIPS)
+    check_files(bodies.parent, only={bodies.name})
     keys = [SetKey(source, actor, action, rig, frame) for frame in sorted(frames)]
     rows = [row for row in read_bodies(bodies) if (row["source"], row["actor"]) == (source, actor)]
     if not rows:
@@ -85,7 +89,7 @@ def main(
     skipped = [] if motion else unusable_frames(keys, rows)
     usable = [key for key in keys if key.frame not in {item["frame"] for item in skipped}]
     with work_folder(work, recipe=recipe) as content, termination_flag() as terminated:
-        missing = [key for key in usable if not set_folder(content, key).exists()]
+        missing = [key for key in usable if not is_finished(set_folder(content, key))]
         if missing:
             model = load_body_model(config.body_path)
             poses = (
@@ -204,6 +208,7 @@ def render_sets(
                 )
                 rows = render_set(key, pose, studio, folder=folder, encoder=encoder)
                 write_table(rows, schema=schemas.RENDER, path=folder / RENDERS_NAME)
+                record_files(folder)
             views = (index + 1) * len(VIEWS)
             rate = views / (time.monotonic() - started)
             left_s = (len(keys) - index - 1) * len(VIEWS) / rate
@@ -252,10 +257,12 @@ def publish(
     keys: list[SetKey], skipped: list[Row], record: dict[str, Any], *, content: Path, out: Path
 ) -> None:
     """Make the shard's folder from its finished sets, by one rename."""
-    rows = []
+    rows, files = [], []
     with atomic_folder(out) as folder:
         for key in keys:
             done = set_folder(content, key)
+            # recorded when they were rendered: what has become of them since must not be believed
+            files += [row for name, row in read_records(done).items() if name != RENDERS_NAME]
             for row in read_table(done / RENDERS_NAME, schema=schemas.RENDER):
                 rows.append(row)
                 for column in IMAGE_FOLDERS:
@@ -264,6 +271,22 @@ def publish(
         text = json.dumps(skipped, indent=1, sort_keys=True) + "\n"
         write_bytes(folder / SKIPPED_NAME, text.encode())
         write_provenance(record, folder=folder)
+        record_files(folder, known=files)
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a set's folder is there and whole; a damaged one is removed, to be made again."""
+    if not folder.exists():
+        return False
+    records = read_records(folder)
+    damages = [find_damage(folder, row) for row in records.values()]
+    found = [damage for damage in damages if damage is not None]
+    if records and not found:
+        return True
+    for damage in found:
+        sys.stderr.write(f"{damage.path} {damage.what}: the set is rendered again\n")
+    shutil.rmtree(folder)
+    return False
 
 
 def set_folder(content: Path, key: SetKey) -> Path:

@@ -6,13 +6,16 @@ from ntop.annotation.annotate import ViewImages, annotate_view
 from ntop.config.sections import AnnotateConfig
 from ntop.conventions import MASK_ALPHA, DataError
 from ntop.storage import schemas
+from ntop.storage.files import check_files
 from ntop.storage.images import read_depth, read_parts, read_rgba
+from ntop.storage.remedies import remedy
 from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row, read_table, write_table
 
 
 def main(config: AnnotateConfig, renders: Path, out: Path) -> None:  # noqa: ARG001
     """Annotate one shard: `renders` is the shard's folder, `out` the table (schema KEYPOINTS)."""
+    check_files(renders)
     rows = read_table(renders / "renders.parquet", schema=schemas.RENDER)
     annotated = [
         annotate_view(row, read_view(row, folder=renders), camera=fisheye_camera(row))
@@ -38,6 +41,6 @@ def read_view(row: Row, *, folder: Path) -> ViewImages:
         if shape != (row["height"], row["width"]):
             raise DataError(
                 f"{folder / row[column]}: {shape[1]}x{shape[0]} px, the table says "
-                f"{row['width']}x{row['height']}; rerun the render stage for this shard"
+                f"{row['width']}x{row['height']}; {remedy(folder)}"
             )
     return ViewImages(mask=rgba[..., 3] >= MASK_ALPHA, depth_m=depth_m, parts=parts)

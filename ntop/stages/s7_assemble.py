@@ -18,9 +18,11 @@ from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.card import dataset_card
 from ntop.storage.coco import COCO17, SMPL24, CocoWriter, coco_writer
+from ntop.storage.files import file_row, files_writer, find_damage, raise_damage, read_records
 from ntop.storage.links import link_or_copy
 from ntop.storage.manifest import ManifestWriter, manifest_writer
 from ntop.storage.provenance import code_sha256, json_sha256
+from ntop.storage.remedies import FILES_NAME, remedy
 from ntop.storage.renders import IMAGE_FOLDERS, set_key
 from ntop.storage.sets import set_record, write_set
 from ntop.storage.tables import Row, read_table
@@ -65,7 +67,7 @@ def main(
     )
     shards = [Shard(renders / key, annotations / f"{key}.parquet") for key in keys]
     totals = Totals()
-    with atomic_folder(out) as folder:
+    with atomic_folder(out) as folder, files_writer(folder) as files:
         with ExitStack() as stack:
             manifest = stack.enter_context(manifest_writer(folder))
             coco = {
@@ -80,10 +82,14 @@ def main(
                 for split in SPLITS
             }
             for shard in in_order(shards):
-                add_shard(
+                rows = add_shard(
                     shard, actors=actors, folder=folder, manifest=manifest, coco=coco, totals=totals
                 )
+                files.add(rows)
         write_summary(config, shards, totals=totals, folder=folder)
+        once = [*folder.glob("*"), *(folder / "annotations").glob("*")]
+        named = sorted(path for path in once if path.is_file() and path.name != FILES_NAME)
+        files.add(file_row(path, folder=folder) for path in named)
 
 
 def actors_by_key(config: AssembleConfig) -> dict[tuple[str, str], Actor]:
@@ -126,8 +132,13 @@ def add_shard(
     manifest: ManifestWriter,
     coco: dict[tuple[str, str], CocoWriter],
     totals: Totals,
-) -> None:
-    """Add a shard's sets to every file of the dataset."""
+) -> list[Row]:
+    """Add a shard's sets to every file of the dataset; returns the record of the files it brings.
+
+    Raises:
+        DataError: a file of the shard is not what was rendered.
+    """
+    records, files = read_records(shard.renders), []
     for pairs in sets_of(shard):
         body = pairs[0][0]
         actor = actors.get((body["source"], body["actor"]))
@@ -140,7 +151,16 @@ def add_shard(
         for render, annotated in pairs:
             row = manifest_row(render, persons=annotated["persons"], split=actor.split)
             for column in IMAGE_FOLDERS:
+                record = records.get(render[column])
+                if record is None:
+                    raise DataError(
+                        f"{shard.renders} has no record of {render[column]}: another version of "
+                        f"ntop rendered it; {remedy(shard.renders)}"
+                    )
+                # the last look: whatever damages a picture later is the dataset's, not the run's
+                raise_damage(find_damage(shard.renders, record), shard.renders)
                 link_or_copy(shard.renders / render[column], folder / row[column])
+                files.append(record | {"path": row[column]})
             manifest.add(row)
             rows.append(row)
             for skeleton, points in (
@@ -155,8 +175,9 @@ def add_shard(
                 (actor.source, actor.actor, actor.gender),
                 sizes_px=[tuple(person["bbox_xywh_px"][2:]) for person in row["persons"]],
             )
-        write_set(set_record(rows, body=body), folder=folder)
+        files.append(write_set(set_record(rows, body=body), folder=folder))
         totals.num_sets += 1
+    return files
 
 
 def sets_of(shard: Shard) -> Iterator[list[tuple[Row, Row]]]:

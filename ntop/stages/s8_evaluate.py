@@ -45,6 +45,7 @@ from ntop.report.summary import (
 from ntop.report.training import training_charts
 from ntop.report.truth import score_truth, truth_comparison, truth_values
 from ntop.storage.atomic import atomic_folder
+from ntop.storage.files import check_files
 
 KIB_PER_GB = 1024**2
 Values = dict[str, float | None]
@@ -80,6 +81,7 @@ def main(
     """
     started = time.monotonic()
     actors = actor_folders(captures, mattes=mattes, bodies=bodies, avatars=avatars)
+    check_files(*captures, *mattes, *bodies, *avatars)
     assembled = Dataset.read(dataset)
     reports = {actor.name: report_actor(config, assembled, actor) for actor in actors}
     values = mean_values([report.values for report in reports.values()])

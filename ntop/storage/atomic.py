@@ -59,7 +59,13 @@ def atomic_folder(target: Path) -> Iterator[Path]:
             f"cannot make folder {work}: {error.strerror or error}; "
             "check the permissions and the free space"
         ) from error
-    yield work
+    try:
+        yield work
+    except OSError as error:
+        raise DataError(
+            f"cannot write {error.filename or work}: {error.strerror or error}; "
+            "check the folder's permissions and the free space, then run the same command again"
+        ) from error
     publish_folder(work, target)
 
 

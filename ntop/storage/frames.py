@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ntop.conventions import DataError
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -102,7 +103,7 @@ def _read_still(path: Path) -> Picture:
     bgr = cv2.imread(str(path), flags) if path.is_file() else None
     if bgr is None:
         problem = "cannot be decoded" if path.is_file() else "does not exist"
-        raise DataError(f"picture {path} {problem}; rerun the capture stage")
+        raise DataError(f"picture {path} {problem}; {remedy(path)}")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 

@@ -16,6 +16,7 @@ from numpy import ndarray
 from ntop.conventions import DEPTH_STEP_M, DataError
 from ntop.storage.atomic import write_bytes
 from ntop.storage.png import decode_png, encode_png
+from ntop.storage.remedies import remedy
 
 DILATION_PX = 3  # straight colour reaches this far beyond alpha > 0: scaling mixes in no black
 DEPTH_LIMIT_M = 65535 * DEPTH_STEP_M
@@ -147,12 +148,10 @@ def _read(path: Path, *, channels: int, dtype: type) -> np.ndarray:
         pixels = decode_png(path.read_bytes())
     except OSError as error:
         raise DataError(
-            f"cannot read image {path}: {error.strerror or error}; rerun the stage that writes it"
+            f"cannot read image {path}: {error.strerror or error}; {remedy(path)}"
         ) from error
     except ValueError as error:
-        raise DataError(
-            f"{path} is not a whole PNG: {error}; delete it and rerun the stage that writes it"
-        ) from error
+        raise DataError(f"{path} is not a whole PNG: {error}; {remedy(path)}") from error
     got = 1 if pixels.ndim == 2 else pixels.shape[2]
     if got != channels or pixels.dtype != dtype:
         raise DataError(

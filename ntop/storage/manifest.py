@@ -42,7 +42,9 @@ def manifest_writer(folder: Path) -> Iterator[ManifestWriter]:
 
     Not atomic: a dataset is built in a work folder and published as a whole.
     """
-    with pq.ParquetWriter(folder / MANIFEST_NAME, schemas.MANIFEST, compression="zstd") as writer:
+    with pq.ParquetWriter(
+        folder / MANIFEST_NAME, schemas.MANIFEST, compression="zstd", write_page_checksum=True
+    ) as writer:
         rows = ManifestWriter(writer)
         yield rows
         rows.flush()

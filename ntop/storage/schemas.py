@@ -52,6 +52,9 @@ CAMERA = pa.schema(
     ]
 )
 
+# What a finished folder holds (ntop.storage.files); paths are relative to it.
+FILE = pa.schema([("path", STRING), ("num_bytes", INT64), ("sha256", STRING)])
+
 # Soft matte, 8 bit, as large as the frame. `confidence` in [0, 1].
 MASK = pa.schema(
     [

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ntop.storage.atomic import write_bytes
+from ntop.storage.files import content_row
 from ntop.storage.tables import Row
 
 CAMERA_KEYS = (
@@ -49,9 +50,10 @@ def set_record(rows: list[Row], *, body: Row) -> dict[str, Any]:
     }
 
 
-def write_set(record: dict[str, Any], *, folder: Path) -> Path:
-    """Write a set's file below `sets/`; returns its path relative to the dataset's folder."""
+def write_set(record: dict[str, Any], *, folder: Path) -> Row:
+    """Write a set's file below `sets/`; returns its record (schema FILE) there."""
     place = "/".join(record[key] for key in ("split", "source", "actor", "action", "rig"))
-    path = folder / "sets" / place / f"{record['frame']:06d}.json"
-    write_bytes(path, (json.dumps(record, separators=(",", ":"), allow_nan=False) + "\n").encode())
-    return path.relative_to(folder)
+    name = f"sets/{place}/{record['frame']:06d}.json"
+    content = (json.dumps(record, separators=(",", ":"), allow_nan=False) + "\n").encode()
+    write_bytes(folder / name, content)
+    return content_row(name, content)

@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 
 from ntop.conventions import DataError
 from ntop.storage.atomic import atomic_path
+from ntop.storage.remedies import remedy
 
 Row = dict[str, Any]
 
@@ -30,7 +31,7 @@ def write_table(rows: list[Row], *, schema: pa.Schema, path: Path) -> None:
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
         raise DataError(f"{path}: a value does not fit its column: {error}") from error
     with atomic_path(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
 def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
@@ -40,14 +41,12 @@ def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
         DataError: the file is missing, truncated, or has other columns than expected.
     """
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
-        raise DataError(
-            f"cannot read table {path}: {error}; delete it and run the workflow again"
-        ) from error
+        raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
     if table.schema.names != schema.names:
         raise DataError(
             f"{path}: columns {table.schema.names}, expected {schema.names}; "
-            "it was written by another version: rerun the stage that makes it"
+            f"it was written by another version: {remedy(path)}"
         )
     return table.cast(schema).to_pylist()

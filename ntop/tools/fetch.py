@@ -52,6 +52,9 @@ def fetch(package: Package, *, out: Path) -> None:
         shutil.rmtree(work, ignore_errors=True)  # left by a run that was killed
         try:
             _unpack(package, archive=archive, folder=work)
+            from ntop.storage.files import record_files  # a bare Python is told first what it lacks
+
+            record_files(work)
             publish_folder(work, out)
         finally:
             shutil.rmtree(work, ignore_errors=True)

@@ -28,6 +28,7 @@ from ntop.stages import s6_annotate, s7_assemble
 from ntop.storage import schemas
 from ntop.storage.atomic import write_bytes
 from ntop.storage.cameras import write_cameras
+from ntop.storage.files import record_files
 from ntop.storage.images import write_depth, write_matte, write_parts, write_rgba
 from ntop.storage.keys import SetKey
 from ntop.storage.png import encode_png
@@ -149,6 +150,7 @@ def write_renders(folder: Path, key: tuple[str, str], *, error: float) -> list[d
             )  # fmt: skip
     write_table(rows, schema=schemas.RENDER, path=folder / "renders.parquet")
     (folder / "skipped.json").write_text("[]")
+    record_files(folder)
     return rows
 
 

@@ -11,6 +11,7 @@ from ntop.config.sections import AnnotateConfig
 from ntop.conventions import MASK_ALPHA, DataError
 from ntop.stages import s6_annotate
 from ntop.storage import schemas
+from ntop.storage.files import record_files
 from ntop.storage.images import read_rgba, write_depth, write_parts, write_rgba
 from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import read_table
@@ -84,6 +85,7 @@ def test_a_view_without_a_person_is_kept_and_has_nobody(copied, tmp_path):
     write_rgba(np.zeros((*shape, 3), np.float32), empty, path=folder / row["image_path"])
     write_depth(empty, path=folder / row["depth_path"])
     write_parts(np.zeros(shape, np.uint8), path=folder / row["parts_path"])
+    record_files(folder)
     s6_annotate.main(AnnotateConfig(), renders=folder, out=tmp_path / "labels.parquet")
     labels = read_table(tmp_path / "labels.parquet", schema=schemas.KEYPOINTS)
     assert [len(label["persons"]) for label in labels] == [0] + [1] * 8
@@ -93,9 +95,12 @@ def test_a_view_without_a_person_is_kept_and_has_nobody(copied, tmp_path):
 def test_an_image_of_another_size_or_none_at_all_is_refused(copied, tmp_path):
     folder, row = copied
     write_depth(np.ones((8, 9), np.float32), path=folder / row["depth_path"])
+    with pytest.raises(DataError, match=r"bytes, .* were written.*--forcerun"):
+        s6_annotate.main(AnnotateConfig(), renders=folder, out=tmp_path / "labels.parquet")
+    record_files(folder)  # as if it had been rendered so
     with pytest.raises(DataError, match="9x8 px"):
         s6_annotate.main(AnnotateConfig(), renders=folder, out=tmp_path / "labels.parquet")
     (folder / row["image_path"]).unlink()
-    with pytest.raises(DataError, match="cannot read image"):
+    with pytest.raises(DataError, match="cannot be read: No such file"):
         s6_annotate.main(AnnotateConfig(), renders=folder, out=tmp_path / "labels.parquet")
     assert not (tmp_path / "labels.parquet").exists()

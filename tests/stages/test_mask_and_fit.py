@@ -15,6 +15,7 @@ from ntop.conventions import DataError
 from ntop.metrics.images import mask_iou
 from ntop.stages import s1_capture, s2_mask, s3_fit
 from ntop.storage import schemas
+from ntop.storage.files import record_files
 from ntop.storage.images import read_matte, write_matte
 from ntop.storage.tables import read_table, write_table
 
@@ -92,6 +93,7 @@ def test_nobody_in_any_picture_is_an_error_and_leaves_nothing(capture, tmp_path)
     for row in read_table(empty / "frames.parquet", schema=schemas.FRAME):
         plate = empty / "plates" / f"{row['action']}_{row['view']}.png"
         shutil.copy(plate, empty / row["image_path"])
+    record_files(empty)
     with pytest.raises(DataError, match="not one frame has a usable mask"):
         s2_mask.main(BACKGROUND, empty, packages=empty, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -102,6 +104,7 @@ def test_one_empty_picture_is_a_row_with_a_reason(capture, tmp_path):
     shutil.copytree(capture, partly)
     row = read_table(partly / "frames.parquet", schema=schemas.FRAME)[3]
     shutil.copy(partly / f"plates/{row['action']}_{row['view']}.png", partly / row["image_path"])
+    record_files(partly)
     s2_mask.main(BACKGROUND, partly, packages=partly, out=tmp_path / "out")
     rows = read_table(tmp_path / "out/masks.parquet", schema=schemas.MASK)
     reasons = {(r["frame"], r["view"]): r["reason"] for r in rows if r["reason"]}
@@ -113,6 +116,7 @@ def test_a_plate_of_another_size_is_named(capture, tmp_path):
     shutil.copytree(capture, broken)
     plate = next((broken / "plates").glob("*.png"))
     cv2.imwrite(str(plate), np.zeros((10, 10, 3), np.uint8))
+    record_files(broken)
     with pytest.raises(DataError, match=rf"{plate.stem}.*expected 160x160"):
         s2_mask.main(BACKGROUND, broken, packages=broken, out=tmp_path / "out")
 

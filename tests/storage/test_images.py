@@ -132,5 +132,5 @@ def test_broken_missing_and_mistaken_files_name_the_remedy(tmp_path):
         path.write_bytes(broken)
         with pytest.raises(DataError, match="not a whole PNG"):
             read_rgba(path)
-    with pytest.raises(DataError, match="rerun the stage"):
+    with pytest.raises(DataError, match=r"--forcerun .*missing\.png"):
         read_rgba(tmp_path / "missing.png")

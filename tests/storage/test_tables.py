@@ -40,7 +40,7 @@ def test_a_truncated_table_is_an_error_with_its_name(tmp_path):
     path = tmp_path / "t.parquet"
     write_table(ROWS, schema=SCHEMA, path=path)
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(DataError, match=r"t\.parquet.*run the workflow again"):
+    with pytest.raises(DataError, match=r"t\.parquet.*--forcerun"):
         read_table(path, schema=SCHEMA)
 
 

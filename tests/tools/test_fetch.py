@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from ntop.conventions import ConfigError, DataError
+from ntop.storage.remedies import FILES_NAME
 from ntop.tools import fetch as fetch_module
 from ntop.tools.fetch import CACHE_VARIABLE, fetch, main
 from ntop.tools.packages import PACKAGES, Package
@@ -62,7 +63,7 @@ def package(index) -> Package:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != FILES_NAME)
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 

@@ -6,6 +6,9 @@ min_version("9.10")
 configfile: "config/config.yaml"
 
 
+report: "workflow/report/workflow.rst"
+
+
 include: "workflow/rules/common.smk"
 include: "workflow/rules/0_fetch.smk"
 include: "workflow/rules/1_capture.smk"

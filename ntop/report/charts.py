@@ -1,4 +1,4 @@
-"""Line and bar charts as inline SVG, coloured by the page's style sheet (light and dark)."""
+"""Line and bar charts as SVG: inline in the page, which colours them, or as files of their own."""
 
 import html
 import math
@@ -11,6 +11,61 @@ DOTTED = 20  # curves of so few values show each; a single one would be no line
 LEFT, RIGHT, TOP, BOTTOM = 62, 16, 18, 44
 
 
+LEGEND_ROW = 20  # of a chart in a file of its own, pixels
+# the page's light colours, for a chart that no page gives its own
+STYLE = """
+text { font: 12px system-ui, "Segoe UI", "DejaVu Sans", sans-serif; fill: #5f646d; }
+.title { font-size: 14px; font-weight: 600; fill: #1d1f23; } .axis { fill: #1d1f23; }
+.mid { text-anchor: middle; } .end { text-anchor: end; } .grid { stroke: #e3e0d8; }
+.curve { fill: none; stroke-width: 2; } .bar { fill: #c2410c; }
+.curve.k0 { stroke: #c2410c; } .curve.k1 { stroke: #0f766e; }
+.curve.k2 { stroke: #4f46e5; } .curve.k3 { stroke: #a16207; }
+.dot.k0, .key.k0 { fill: #c2410c; } .dot.k1, .key.k1 { fill: #0f766e; }
+.dot.k2, .key.k2 { fill: #4f46e5; } .dot.k3, .key.k3 { fill: #a16207; }
+"""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """The elements of a drawing of `WIDTH` by `height`, its title and its legend's names."""
+
+    title: str
+    height: int
+    elements: str
+    legend: tuple[tuple[str, int], ...] = ()  # name and kind of each line
+
+    @property
+    def figure(self) -> str:
+        """A figure for the page, whose style sheet colours it."""
+        keys = "".join(f'<span class="key k{k}">{_safe(name)}</span>' for name, k in self.legend)
+        caption = f"{_safe(self.title)} <span class=keys>{keys}</span>" if keys else None
+        return (
+            f'<figure class="chart"><svg viewBox="0 0 {WIDTH} {self.height}" role="img" '
+            f'aria-label="{_safe(self.title)}">{self.elements}</svg>'
+            f"<figcaption>{caption or _safe(self.title)}</figcaption></figure>"
+        )
+
+    @property
+    def document(self) -> str:
+        """An SVG file, with title and legend in it."""
+        top, names = 34, self.legend if len(self.legend) > 1 else ()
+        height = top + self.height + LEGEND_ROW * len(names) + 8
+        keys = []
+        for row, (name, kind) in enumerate(names):
+            y = top + self.height + LEGEND_ROW * row + 12
+            keys.append(
+                f'<rect class="key k{kind}" x="{LEFT}" y="{y - 6}" width="16" height="3"/>'
+                f'<text x="{LEFT + 24}" y="{y}">{_safe(name)}</text>'
+            )
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+            f'width="{2 * WIDTH}" height="{2 * height}"><style>{STYLE}</style>'
+            f'<rect width="{WIDTH}" height="{height}" fill="#ffffff"/>'
+            f'<text class="title" x="14" y="22">{_safe(self.title)}</text>'
+            f'<g transform="translate(0 {top})">{self.elements}</g>{"".join(keys)}</svg>\n'
+        )
+
+
 @dataclass(frozen=True)
 class Line:
     """One curve; `kind` selects its colour (0 to 3)."""
@@ -21,14 +76,14 @@ class Line:
     kind: int = 0
 
 
-def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> str:
-    """Curves over a common x axis; non-finite values are left out."""
+def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> Chart | None:
+    """Curves over a common x axis; non-finite values are left out. None if nothing remains."""
     finite = [
         [(x, y) for x, y in zip(line.x, line.y, strict=True) if math.isfinite(y)] for line in lines
     ]
     values = [point for points in finite for point in points]
     if not values:
-        return ""
+        return None
     x_ticks = _ticks(min(v[0] for v in values), max(v[0] for v in values))
     y_ticks = _ticks(min(v[1] for v in values), max(v[1] for v in values))
     x_span, y_span = (x_ticks[0], x_ticks[-1]), (y_ticks[0], y_ticks[-1])
@@ -64,15 +119,11 @@ def line_chart(lines: list[Line], *, title: str, x_label: str, y_label: str) -> 
         f'<text transform="translate(14 {y_middle}) rotate(-90)" class="axis mid">'
         f"{_safe(y_label)}</text>"
     )
-    legend = "".join(f'<span class="key k{line.kind}">{_safe(line.name)}</span>' for line in lines)
-    return (
-        f'<figure class="chart"><svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
-        f'aria-label="{_safe(title)}">{"".join(parts)}</svg>'
-        f"<figcaption>{_safe(title)} <span class=keys>{legend}</span></figcaption></figure>"
-    )
+    legend = tuple((line.name, line.kind) for line in lines)
+    return Chart(title, HEIGHT, "".join(parts), legend)
 
 
-def bar_chart(values: dict[str, float | None], *, title: str, unit: str) -> str:
+def bar_chart(values: dict[str, float | None], *, title: str, unit: str) -> Chart:
     """Horizontal bars, one per entry, each with its number; a missing value says so."""
     row, label_width = 30, 110
     height = row * len(values) + 8
@@ -89,11 +140,7 @@ def bar_chart(values: dict[str, float | None], *, title: str, unit: str) -> str:
             f'height="{row - 10}" rx="3"/>'
             f'<text x="{label_width + length + 8:.1f}" y="{y + 19}" class="tick">{shown}</text>'
         )
-    return (
-        f'<figure class="chart"><svg viewBox="0 0 {WIDTH} {height}" role="img" '
-        f'aria-label="{_safe(title)}">{"".join(parts)}</svg>'
-        f"<figcaption>{_safe(title)}</figcaption></figure>"
-    )
+    return Chart(title, height, "".join(parts))
 
 
 def human(value: float) -> str:

@@ -1,6 +1,9 @@
 """The pictures of the dataset itself: nine views with overlays, and what comes with an image."""
 
+from dataclasses import dataclass
+
 import numpy as np
+from jaxtyping import UInt8
 
 from ntop.body.skeletons import COCO17_NAMES, COCO17_SKELETON, SMPL24_EDGES, SMPL24_NAMES
 from ntop.conventions import MASK_ALPHA
@@ -77,29 +80,62 @@ def representative_sets(dataset: Dataset, actor: ActorFolders) -> dict[str, SetK
     return chosen
 
 
-def contact_sheet(dataset: Dataset, key: SetKey, *, index: int) -> Sheet:
-    """The nine views of a set in compass order, all with one window size; and one view's layers."""
+@dataclass(frozen=True)
+class View:
+    """One view of a set, cut to the person: its manifest row, a square RGBA image, overlays."""
+
+    row: Row
+    image: UInt8[np.ndarray, "side side 4"]
+    skeletons: tuple[Skeleton, ...]
+
+    @property
+    def direction(self) -> str:
+        """Where the camera is."""
+        return DIRECTIONS[self.row["view"]]
+
+    @property
+    def size_px(self) -> tuple[float, float]:
+        """Width and height of the person's box."""
+        return tuple(self.row["persons"][0]["bbox_xywh_px"][2:])
+
+    @property
+    def num_seen(self) -> int:
+        """How many of the 17 keypoints are visible."""
+        return sum(flag == 2 for flag in self.row["persons"][0]["visibility_coco17"])
+
+
+def cut_views(dataset: Dataset, key: SetKey) -> list[View]:
+    """The views of a set in compass order, all cut with one window size."""
     views = dataset.sets[key]
     rows = [views[name] for line in COMPASS for name in line if name in views]
     boxes = [row["persons"][0]["bbox_xywh_px"] for row in rows]
     side = max(max(box[2:]) for box in boxes) * WINDOW_MARGIN
-    pictures = []
+    cut = []
     for row, (left, top, width, height) in zip(rows, boxes, strict=True):
-        person = row["persons"][0]
         window = square_with(centre=(left + width / 2, top + height / 2), side=side)
         image = window.of(read_rgba(dataset.image_path(row)))
-        seen = sum(flag == 2 for flag in person["visibility_coco17"])
-        name = DIRECTIONS[row["view"]]
+        cut.append(View(row, image, cropped(skeletons_of(row["persons"][0]), window)))
+    return cut
+
+
+def contact_sheet(dataset: Dataset, key: SetKey, *, index: int) -> Sheet:
+    """The nine views of a set in compass order, all with one window size; and one view's layers."""
+    views = cut_views(dataset, key)
+    pictures = []
+    for view in views:
+        width, height = view.size_px
         pictures.append(
             picture(
-                image,
-                alt=f"{name} camera: the person seen from above, {seen} of 17 keypoints visible",
-                caption=f"{name}: {width:.0f} × {height:.0f} px, {seen} of 17 keypoints visible",
-                skeletons=cropped(skeletons_of(person), window),
+                view.image,
+                alt=f"{view.direction} camera: the person seen from above, "
+                f"{view.num_seen} of 17 keypoints visible",
+                caption=f"{view.direction}: {width:.0f} × {height:.0f} px, "
+                f"{view.num_seen} of 17 keypoints visible",
+                skeletons=view.skeletons,
             )
         )
     title = f"{key.source}/{key.actor} · {key.action}, frame {key.frame} · rig {key.rig}"
-    layer_row = views.get(LAYER_VIEW, rows[0])
+    layer_row = dataset.sets[key].get(LAYER_VIEW, views[0].row)
     return Sheet(index, title, tuple(pictures), layers(dataset, layer_row))
 
 

@@ -1,19 +1,14 @@
-"""What the evaluation reads: the dataset's rows, each actor's folders, the jobs' costs."""
+"""What the evaluation reads: the dataset's rows, each actor's folders."""
 
-import csv
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ntop.config.sections import STAGE_SECTIONS
 from ntop.conventions import DataError
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import set_key
 from ntop.storage.tables import Row, read_table
-
-MB_PER_GB = 1024.0  # Snakemake reports mebibytes
 
 
 @dataclass(frozen=True)
@@ -97,32 +92,3 @@ def actor_folders(
         ActorFolders(*paths[0].parts[-2:], *paths)
         for paths in zip(captures, mattes, bodies, avatars, strict=True)
     ]
-
-
-def stage_costs(benchmarks: Path) -> dict[str, float | None]:
-    """`seconds.{stage}` (sum over jobs) and `peak_memory_gb.{stage}` (largest job).
-
-    Reads Snakemake's benchmark tables below `{number}_{stage}/`. A stage without one has no figure;
-    a job too short to be sampled has no memory, but counts with its time.
-    """
-    costs: dict[str, float | None] = {}
-    for number, name in enumerate(STAGE_SECTIONS, start=1):
-        seconds, memory_mb = [], []
-        for path in sorted((benchmarks / f"{number}_{name}").rglob("*.tsv")):
-            with path.open(newline="") as stream:
-                for row in csv.DictReader(stream, delimiter="\t"):
-                    seconds.append(_number(row.get("s")))
-                    memory_mb.append(_number(row.get("max_rss")))
-        times = [s for s in seconds if math.isfinite(s)]
-        peaks = [m for m in memory_mb if math.isfinite(m)]
-        costs[f"seconds.{name}"] = round(sum(times), 3) if times else None
-        costs[f"peak_memory_gb.{name}"] = round(max(peaks) / MB_PER_GB, 4) if peaks else None
-    return costs
-
-
-def _number(text: str | None) -> float:
-    """A benchmark's cell; `-` and `NA` mean that the job was too short to be sampled."""
-    try:
-        return float(text) if text is not None else math.nan
-    except ValueError:
-        return math.nan

@@ -1,17 +1,26 @@
 """The report page: what it shows as plain records, and their rendering into one HTML file."""
 
 import html
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from ntop.report.charts import Chart
 from ntop.report.figures import Figure
 from ntop.report.pictures import Picture, Skeleton, skeleton_svg
 from ntop.storage.atomic import write_bytes
 
 TEMPLATE_PATH = Path(__file__).parent / "template.html"
+TABLE_STYLE = """
+body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #1d1f23;
+  background: #ffffff; margin: 20px; }
+p { max-width: 75ch; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: 6px 12px; border-bottom: 1px solid #e3e0d8; }
+th:first-child, td:first-child { text-align: left; } th { color: #5f646d; }
+tr.total td { font-weight: 600; border-top: 2px solid #e3e0d8; }
+"""
 
 
 @dataclass(frozen=True)
@@ -66,13 +75,10 @@ class Page:
     sheets: tuple[Sheet, ...] = ()
     heldout: tuple[Comparison, ...] = ()
     truth: tuple[Comparison, ...] = ()
-    curves: tuple[str, ...] = ()  # SVG
+    curves: tuple[Chart, ...] = ()
     statistics: Table | None = None
-    costs: tuple[str, ...] = ()  # SVG
-    costs_text: str = field(
-        default="Wall time summed over a stage's jobs, and the largest job's resident memory, as "
-        "Snakemake measured them; this stage measured itself."
-    )
+    costs: tuple[Chart, ...] = ()
+    cost_table: Table | None = None
 
     @property
     def strip_columns(self) -> int:
@@ -109,6 +115,14 @@ def render_page(page: Page) -> str:
 def write_page(page: Page, path: Path) -> None:
     """Write the report."""
     write_bytes(path, render_page(page).encode())
+
+
+def table_document(table: Table) -> str:
+    """A table as an HTML file of its own."""
+    return (
+        f"<!doctype html><html lang=en><meta charset=utf-8><style>{TABLE_STYLE}</style>"
+        f"<p>{html.escape(table.text)}</p>{_table(table)}</html>\n"
+    )
 
 
 def _overlay(overlay: Skeleton, picture: Picture) -> Markup:

@@ -5,7 +5,7 @@ Images are uint8 RGB or RGBA (straight alpha), `[v, u]`; points are in pixels, f
 
 import base64
 import html
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,10 @@ class Skeleton:
     visibility: UInt8[np.ndarray, " keypoint"]
     edges: tuple[tuple[int, int], ...]
     labels: tuple[str, ...]
+
+    def scaled(self, scale: float) -> "Skeleton":
+        """The same for a resized picture."""
+        return replace(self, points_px=self.points_px * scale)
 
 
 @dataclass(frozen=True)
@@ -98,16 +102,13 @@ def picture(
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         image = cv2.resize(_premultiplied(image), size, interpolation=cv2.INTER_AREA)
         image = _straight(image)
-    scaled = tuple(
-        Skeleton(s.name, s.points_px * scale, s.visibility, s.edges, s.labels) for s in skeletons
-    )
     return Picture(
         uri=_data_uri(image),
         width=image.shape[1],
         height=image.shape[0],
         alt=alt,
         caption=caption,
-        skeletons=scaled,
+        skeletons=tuple(skeleton.scaled(scale) for skeleton in skeletons),
     )
 
 

@@ -12,6 +12,7 @@ from ntop.metrics.images import (
     ssim_box,
     tight_window,
 )
+from ntop.report.charts import Chart, Line, line_chart
 from ntop.report.page import Table
 
 
@@ -55,6 +56,30 @@ def best_median_worst(scores: list[ImageScores]) -> dict[str, int]:
     order = sorted(range(len(scores)), key=lambda index: -scores[index].psnr_box_db)
     shown = {order[len(order) // 2]: "median", order[-1]: "worst", order[0]: "best"}
     return {shown[index]: index for index in order if index in shown}
+
+
+def score_curves(scores: list[ImageScores], *, what: str) -> dict[str, Chart]:
+    """PSNR and mask IoU of all pictures, each sorted from best to worst, by a short name."""
+    share = [100 * (index + 0.5) / len(scores) for index in range(len(scores))]
+
+    def falling(name: str, column: str, kind: int) -> Line:
+        return Line(name, share, sorted((getattr(s, column) for s in scores), reverse=True), kind)
+
+    psnr = [
+        falling("avatar, person's pixels", "psnr_person_db", 0),
+        falling("avatar, person's box", "psnr_box_db", 1),
+        falling("painted body, person's box", "baseline_psnr_box_db", 2),
+    ]
+    charts = {
+        "PSNR": (psnr, f"{what}: PSNR", "PSNR (dB)"),
+        "mask IoU": ([falling("avatar", "mask_iou", 0)], f"{what}: mask overlap", "mask IoU"),
+    }
+    x_label = "% of pictures, best first"
+    drawn = {
+        name: line_chart(lines, title=title, x_label=x_label, y_label=y_label)
+        for name, (lines, title, y_label) in charts.items()
+    }
+    return {name: chart for name, chart in drawn.items() if chart is not None}
 
 
 def score_table(groups: dict[str, list[ImageScores]], *, first: str) -> Table:

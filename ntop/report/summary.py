@@ -2,15 +2,17 @@
 
 import json
 import platform
+from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from ntop.conventions import DataError
-from ntop.report.charts import bar_chart
-from ntop.report.figures import CHECKS, MEANINGS, STAGE_NAMES, Figure, figure
+from ntop.report.figures import CHECKS, MEANINGS, Figure, figure
 from ntop.report.inputs import ActorFolders, Dataset
 from ntop.report.page import Table
+from ntop.storage import schemas
+from ntop.storage.tables import read_table
 
 TILES = (
     "truth.psnr_box_db",
@@ -22,6 +24,7 @@ TILES = (
     "truth.visibility_agreement",
     "checks.visible_on_mask",
 )
+MOST_REASONS = 200
 PACKAGES = ("numpy", "torch", "numba", "opencv-contrib-python-headless", "pyarrow", "snakemake")
 
 
@@ -87,17 +90,29 @@ def statistics_table(record: dict[str, Any]) -> Table:
     return Table(head, tuple(rows), text=text, total=True)
 
 
-def cost_charts(costs: dict[str, float | None]) -> tuple[str, ...]:
-    """Time and memory per stage."""
-    if all(value is None for value in costs.values()):
-        return ()
-    seconds = {name: costs[f"seconds.{name}"] for name in STAGE_NAMES}
-    memory = {name: costs[f"peak_memory_gb.{name}"] for name in STAGE_NAMES}
-    total = sum(value for value in seconds.values() if value is not None)
-    return (
-        bar_chart(seconds, title=f"Time per stage, {total:,.0f} s in all jobs together", unit="s"),
-        bar_chart(memory, title="Largest resident memory of a stage's jobs", unit="GB"),
-    )
+def left_out_table(record: dict[str, Any], actors: list[ActorFolders]) -> Table:
+    """What no image was made of, by stage, actor and reason: recorded frames and sets."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for actor in actors:
+        for stage, path, schema in (
+            ("capture", actor.capture / "frames.parquet", schemas.FRAME),
+            ("mask", actor.mattes / "masks.parquet", schemas.MASK),
+            ("fit", actor.bodies / "bodies.parquet", schemas.BODY),
+        ):
+            reasons = read_table(path, schema=schema)
+            counts.update((stage, actor.name, row["reason"]) for row in reasons if row["reason"])
+    for item in record["skipped"]:
+        counts["render", f"{item['source']}/{item['actor']}", item["reason"]] += 1
+    rows = [(*key, str(count)) for key, count in counts.most_common(MOST_REASONS)]
+    text = "Every planned set became images and every recorded frame was usable."
+    if rows:
+        text = (
+            "Frames that a stage could not use, and planned sets without images, with the stage's "
+            "own words."
+        )
+    if len(counts) > len(rows):
+        text += f" The {len(rows)} most frequent of {len(counts)} reasons."
+    return Table(("stage", "actor", "reason", "count"), tuple(rows), text=text)
 
 
 def provenance_rows(

@@ -1,26 +1,39 @@
 """Training curves of the avatars as charts."""
 
 import math
+from dataclasses import dataclass
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ntop.conventions import DataError
-from ntop.report.charts import Line, line_chart
+from ntop.report.charts import Chart, Line, line_chart
 from ntop.report.inputs import ActorFolders
 
+
+@dataclass(frozen=True)
+class Curve:
+    """A column of the training's record: title of its chart, its axis, and a short name."""
+
+    title: str
+    label: str
+    short: str
+
+
 CURVES = {
-    "loss": ("Training loss", "loss"),
-    "psnr_person_db": ("Training rays on the person", "PSNR (dB)"),
-    "watched_psnr_db": ("Watched frames of the training cameras, never trained on", "PSNR (dB)"),
+    "loss": Curve("Training loss", "loss", "loss"),
+    "psnr_person_db": Curve("Training rays on the person", "PSNR (dB)", "training rays"),
+    "watched_psnr_db": Curve(
+        "Watched frames of the training cameras, never trained on", "PSNR (dB)", "watched frames"
+    ),
 }
 
 
-def training_charts(actors: list[ActorFolders]) -> tuple[str, ...]:
-    """One chart per measured quantity, one line per actor."""
+def training_charts(actors: list[ActorFolders]) -> dict[str, Chart]:
+    """One chart per measured column, one line per actor."""
     tables = {actor.name: _curve(actor) for actor in actors}
-    charts = []
-    for column, (title, label) in CURVES.items():
+    charts = {}
+    for column, curve in CURVES.items():
         lines = []
         for kind, (name, columns) in enumerate(tables.items()):
             points = [
@@ -31,9 +44,11 @@ def training_charts(actors: list[ActorFolders]) -> tuple[str, ...]:
             if points:
                 x, y = ([float(v) for v in axis] for axis in zip(*points, strict=True))
                 lines.append(Line(name, x, y, kind % 4))
-        if lines:
-            charts.append(line_chart(lines, title=title, x_label="step", y_label=label))
-    return tuple(charts)
+        title = f"{curve.title}: {lines[0].name}" if len(actors) == 1 and lines else curve.title
+        chart = line_chart(lines, title=title, x_label="step", y_label=curve.label)
+        if chart is not None:
+            charts[column] = chart
+    return charts
 
 
 def _curve(actor: ActorFolders) -> dict[str, list[float | None]]:

@@ -1,9 +1,8 @@
-"""Stage 8, evaluate: dataset, captures, avatars -> metrics.json and report.html."""
+"""Stage 8, evaluate: dataset, captures, avatars -> metrics.json, report.html and its exhibits."""
 
 import json
-import resource
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,14 @@ from ntop.metrics.images import Cutout
 from ntop.report.blobs import blob_max_px
 from ntop.report.capture import Recording
 from ntop.report.checks import check_masks, coco_self_ap, reprojection_max_px
+from ntop.report.costs import cost_charts, cost_table, cost_values, stage_costs, with_own
+from ntop.report.exhibits import (
+    Exhibit,
+    actor_exhibits,
+    dataset_exhibits,
+    score_exhibits,
+    write_exhibits,
+)
 from ntop.report.figures import complete, figures, write_metrics
 from ntop.report.gallery import contact_sheet, representative_sets
 from ntop.report.heldout import (
@@ -29,14 +36,14 @@ from ntop.report.heldout import (
     heldout_values,
     score_heldout,
 )
-from ntop.report.inputs import ActorFolders, Dataset, actor_folders, stage_costs
+from ntop.report.inputs import ActorFolders, Dataset, actor_folders
 from ntop.report.making import making_strip
 from ntop.report.mesh import painted_body
 from ntop.report.page import Comparison, Page, Strip, write_page
 from ntop.report.summary import (
-    cost_charts,
     headline,
     lead,
+    left_out_table,
     provenance_rows,
     read_dataset_record,
     statistics_table,
@@ -47,7 +54,6 @@ from ntop.report.truth import score_truth, truth_comparison, truth_values
 from ntop.storage.atomic import atomic_folder
 from ntop.storage.files import check_files
 
-KIB_PER_GB = 1024**2
 Values = dict[str, float | None]
 
 
@@ -59,6 +65,7 @@ class ActorReport:
     strip: Strip
     heldout: Comparison | None
     truth: Comparison | None
+    exhibits: tuple[Exhibit, ...]
 
 
 def main(
@@ -71,7 +78,7 @@ def main(
     benchmarks: Path,
     out: Path,
 ) -> None:
-    """Write metrics.json and report.html into `out`.
+    """Write metrics.json, report.html and the folder `exhibits` (for `snakemake --report`).
 
     `captures`, `mattes`, `bodies` and `avatars` hold one folder `.../{source}/{actor}` per actor,
     in one order; `benchmarks` is the folder of Snakemake's benchmark tables.
@@ -84,15 +91,27 @@ def main(
     check_files(*captures, *mattes, *bodies, *avatars)
     assembled = Dataset.read(dataset)
     reports = {actor.name: report_actor(config, assembled, actor) for actor in actors}
+    record = read_dataset_record(assembled)
     values = mean_values([report.values for report in reports.values()])
     values |= dataset_values(assembled)
-    values |= stage_costs(benchmarks)
-    values |= own_costs(started)
+    exhibits = [item for report in reports.values() for item in report.exhibits]
+    measured = stage_costs(benchmarks, actors=set(reports), dataset=assembled.name)
+    costs = with_own(measured, started=started)
+    table = cost_table(costs, num_images=len(assembled.rows))
+    exhibits += dataset_exhibits(
+        assembled,
+        statistics=statistics_table(record),
+        left_out=left_out_table(record, actors),
+        costs=table,
+    )
+    values |= cost_values(costs)
     page = compose(assembled, actors, reports=reports, values=complete(values))
+    page = replace(page, costs=cost_charts(costs), cost_table=table)
     with atomic_folder(out) as folder:
         by_actor = {name: report.values for name, report in reports.items()}
         write_metrics(values, by_actor=by_actor, path=folder / "metrics.json")
         write_page(page, folder / "report.html")
+        write_exhibits(exhibits, folder / "exhibits")
 
 
 def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) -> ActorReport:
@@ -106,17 +125,20 @@ def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) 
     paint = painted_body(recording, model, views=seen).cutout
     values = fit_values(actor)
     heldout = truth = None
+    exhibits = actor_exhibits(dataset, actor)
     references = reference_masks(config, actor.source)
     found = score_heldout(recording, references, render=render, paint=paint)
     if found is not None:
         values |= heldout_values(found)
         heldout = heldout_comparison(recording, found)
+        exhibits += score_exhibits(actor, list(found.scores), against="held out camera")
     true = score_truth(dataset, actor, paint=paint)
     if true is not None:
         values |= truth_values(true)
         truth = truth_comparison(dataset, actor, true, paint=paint)
+        exhibits += score_exhibits(actor, list(true.scores), against="truth")
     strip = making_strip(dataset, recording, model=model, render=render)
-    return ActorReport(values, strip, heldout, truth)
+    return ActorReport(values, strip, heldout, truth, tuple(exhibits))
 
 
 def reference_masks(config: EvaluateConfig, source: str) -> ReferenceMasks:
@@ -185,15 +207,6 @@ def mean_values(by_actor: list[Values]) -> Values:
     return means
 
 
-def own_costs(started: float) -> Values:
-    """This stage's own time and memory so far: its benchmark is written after it has ended."""
-    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {
-        "seconds.evaluate": round(time.monotonic() - started, 3),
-        "peak_memory_gb.evaluate": round(peak_kib / KIB_PER_GB, 4),
-    }
-
-
 def compose(
     dataset: Dataset,
     actors: list[ActorFolders],
@@ -215,7 +228,6 @@ def compose(
         sheets=tuple(contact_sheet(dataset, key, index=i) for i, key in enumerate(keys)),
         heldout=tuple(r.heldout for r in reports.values() if r.heldout is not None),
         truth=tuple(r.truth for r in reports.values() if r.truth is not None),
-        curves=training_charts(actors),
+        curves=tuple(training_charts(actors).values()),
         statistics=statistics_table(record),
-        costs=cost_charts(values),
     )

@@ -10,7 +10,7 @@ from ntop.config.plan import planned_jobs
 from ntop.config.run import Run, load_files
 from ntop.conventions import VIEWS, ConfigError
 from ntop.storage.atomic import write_bytes
-from ntop.tools.progress import read_seconds
+from ntop.storage.benchmarks import read_usage
 
 # where nothing was measured yet: the demo on one core (benchmarks/results/demo.json)
 DEFAULT_VIEWS_PER_S = 1.3
@@ -117,9 +117,10 @@ def estimate(run: Run, sets_per_shard: int, pace: Pace) -> Estimate:
 def measured_pace(run: Run, *, directory: Path, views_per_s: float | None) -> Pace:
     """The pace of jobs that have finished in `directory`; stated defaults where there are none."""
     jobs = planned_jobs(run)
-    timed = [(job, read_seconds(directory / job.benchmark)) for job in jobs]
-    renders = [(job, s) for job, s in timed if job.stage == "render" and s]
-    trains = [s for job, s in timed if job.stage == "train" and s]
+    used = [(job, read_usage(directory / job.benchmark)) for job in jobs]
+    timed = [(job, usage.wall_s) for job, usage in used if usage and usage.wall_s]
+    renders = [(job, s) for job, s in timed if job.stage == "render"]
+    trains = [s for job, s in timed if job.stage == "train"]
     views = len(VIEWS) * sum(len(job.frames) for job, _ in renders)
     words = []
     if views_per_s is not None:

@@ -1,8 +1,6 @@
 """How far every planned job is, from what it left on disk; nothing is written or locked."""
 
-import csv
 import json
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import Literal
 
 from ntop.config.plan import Job
 from ntop.conventions import VIEWS
+from ntop.storage.benchmarks import read_usage
 from ntop.tools.alive import QUEUED, Mark, Processes, SlurmJob, jobs_of
 
 State = Literal["done", "running", "queued", "stopped", "failed", "waiting"]
@@ -63,7 +62,8 @@ def progress_of(job: Job, *, directory: Path, seen: Witness) -> Progress:
     state = _state(job, directory=directory, seen=seen)
     if state == "done":
         skipped = _count_skipped(directory / job.output) if job.stage == "render" else 0
-        seconds = read_seconds(directory / job.benchmark)
+        usage = read_usage(directory / job.benchmark)
+        seconds = usage and usage.wall_s
         return Progress(job, state, len(job.frames) - skipped, skipped, seconds)
     if job.stage != "render":
         return Progress(job, state)
@@ -101,16 +101,6 @@ def _count_skipped(shard: Path) -> int:
         return len(json.loads((shard / "skipped.json").read_text()))
     except (OSError, json.JSONDecodeError):
         return 0  # a detail of a summary: the stages are the ones to complain
-
-
-def read_seconds(benchmark: Path) -> float | None:
-    """Wall time of a job in seconds; None without a usable table."""
-    try:
-        with benchmark.open(newline="") as stream:
-            seconds = float(next(csv.DictReader(stream, delimiter="\t"))["s"])
-    except (OSError, StopIteration, KeyError, TypeError, ValueError):
-        return None
-    return seconds if math.isfinite(seconds) else None
 
 
 def log_tail(log: Path) -> str:

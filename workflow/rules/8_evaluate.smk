@@ -8,7 +8,14 @@ rule evaluate:
         avatars=[f"results/4_train/{actor.source}/{actor.actor}" for actor in ACTORS],
         references=reference_mask_files,
     output:
-        directory("results/8_evaluate/{dataset}"),
+        report(
+            directory("results/8_evaluate/{dataset}"),
+            patterns=["exhibits/{topic,[a-z]+}-{words}.{kind,jpg|svg|html}"],
+            category=exhibit_category,
+            subcategory=exhibit_subcategory,
+            labels=exhibit_labels,
+            caption="../report/exhibit.rst",
+        ),
     log:
         "logs/8_evaluate/{dataset}.log",
     benchmark:

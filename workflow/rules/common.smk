@@ -243,3 +243,32 @@ def actor_shards(wildcards):
     if not shards:
         raise ValueError(f"{CONFIG.sequences} has no render line of {actor}")
     return [f"results/6_annotate/{shard}.parquet" for shard in shards]
+
+
+# topic of a file in the report's folder `exhibits` -> category, and what its last word is
+EXHIBITS = {
+    "views": ("Nine views", "rig"),
+    "training": ("Training", "curve"),
+    "scores": ("Scores", "score"),
+    "contents": ("Dataset", "figure"),
+    "run": ("Run", "table"),
+}
+
+
+def exhibit_category(wildcards):
+    category, _ = EXHIBITS[wildcards.topic]
+    return category
+
+
+def exhibit_subcategory(wildcards):
+    """The source, so that a campaign of many actors stays readable; the dataset for the rest."""
+    words = wildcards.words.split("-")
+    return words[0] if len(words) > 1 else wildcards.dataset
+
+
+def exhibit_labels(wildcards):
+    """What the report's table shows of a file."""
+    *actor, last = wildcards.words.split("-")
+    _, label = EXHIBITS[wildcards.topic]
+    shown = last if label == "rig" else last.replace("_", " ")
+    return {"actor": "/".join(actor), label: shown} if actor else {label: shown}

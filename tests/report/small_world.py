@@ -213,6 +213,12 @@ def write_truth(folder: Path, key: tuple[str, str]) -> None:
     pq.write_table(pa.Table.from_pylist(table), folder / "visibility.parquet")
 
 
+def write_benchmark(path: Path, **cells: str) -> None:
+    """A table as Snakemake writes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\t".join(cells) + "\n" + "\t".join(cells.values()) + "\n")
+
+
 def build_world(root: Path) -> World:
     """Write everything below `root`."""
     actors = []
@@ -247,13 +253,17 @@ def build_world(root: Path) -> World:
     table.write_text("\n".join(["source\tactor\taction\tfirst\tlast\tuse", *lines]) + "\n")
     s7_assemble.main(config, table, root / "5_render", root / "6_annotate", dataset)
     benchmarks = root / "benchmarks"
-    for index, name in enumerate(("a", "b")):
-        path = benchmarks / "4_train" / f"{name}.tsv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"s\th:m:s\tmax_rss\n{10 + index}.5\t0:00:10\t{1024 * (index + 1)}.0\n")
-    short = benchmarks / "6_annotate" / "short.tsv"
-    short.parent.mkdir(parents=True)
-    short.write_text("s\th:m:s\tmax_rss\n0.1\t0:00:00\tNA\n")
+    for index, (source, actor) in enumerate(SPLITS):
+        write_benchmark(
+            benchmarks / f"4_train/{source}/{actor}.tsv",
+            s=f"{10 + index}.5", max_rss=f"{1024 * (index + 1)}.0", cpu_time="21.0",
+        )  # fmt: skip
+    write_benchmark(
+        benchmarks / "6_annotate/real/p00/stand.tsv", s="0.1", max_rss="NA", cpu_time="NA"
+    )
+    # another dataset's, in the same results folder
+    write_benchmark(benchmarks / "4_train/studio/other.tsv", s="999", max_rss="99999", cpu_time="9")
+    write_benchmark(benchmarks / "7_assemble/other.tsv", s="999", max_rss="99999", cpu_time="9")
     scores = {"fit.joint_error_mm": 21.5, "fit.mask_iou": 0.9, "refine_cameras.heldout_px": None}
     (actors[1].bodies / "scores.json").write_text(json.dumps(scores))
     return World(root, tuple(actors), dataset, benchmarks)

@@ -1,17 +1,7 @@
 import pytest
 
 from ntop.conventions import DataError
-from ntop.report.inputs import Dataset, actor_folders, stage_costs
-
-
-def test_costs_sum_times_and_take_the_largest_memory(world):
-    costs = stage_costs(world.benchmarks)
-    assert costs["seconds.train"] == 22.0
-    assert costs["peak_memory_gb.train"] == 2.0
-    assert costs["seconds.annotate"] == 0.1
-    assert costs["peak_memory_gb.annotate"] is None  # too short to be sampled
-    assert costs["seconds.render"] is None
-    assert len(costs) == 16
+from ntop.report.inputs import Dataset, actor_folders
 
 
 def test_folders_are_paired_by_actor(world):

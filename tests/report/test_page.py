@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from ntop.body.model import load_body_model
 from ntop.conventions import DataError
 from ntop.report.capture import Recording
-from ntop.report.charts import Line, bar_chart, human, line_chart
+from ntop.report.charts import STYLE, Line, bar_chart, human, line_chart
 from ntop.report.figures import ALWAYS, MEANINGS, complete, figures, write_metrics
 from ntop.report.gallery import COMPASS, contact_sheet, representative_sets
 from ntop.report.inputs import Dataset
@@ -171,16 +172,30 @@ def test_charts_scale_to_their_values():
         [Line("a<b", [0, 10], [1.0, float("nan")]), Line("c", [0, 10], [0.0, 2.0], 1)],
         title="T", x_label="x", y_label="y",
     )  # fmt: skip
-    assert "a&lt;b" in chart and "nan" not in chart
-    assert line_chart([Line("a", [], [])], title="T", x_label="x", y_label="y") == ""
+    assert "a&lt;b" in chart.figure and "nan" not in chart.figure
+    assert line_chart([Line("a", [], [])], title="T", x_label="x", y_label="y") is None
     bars = bar_chart({"one": 2.0, "two": None}, title="T", unit="s")
-    assert "2.00 s" in bars and "not measured" in bars
+    assert "2.00 s" in bars.figure and "not measured" in bars.figure
+
+
+def test_a_chart_in_a_file_of_its_own_is_whole():
+    lines = [Line("a<b", [0, 10], [1.0, 3.0]), Line("c", [0, 10], [0.0, 2.0], 1)]
+    chart = line_chart(lines, title="T & U", x_label="x", y_label="y")
+    svg = ElementTree.fromstring(chart.document)
+    words = [element.text for element in svg.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"T & U", "x", "y", "a<b", "c"} <= set(words)
+    assert max(float(svg.get("width")), float(svg.get("height"))) <= 1600
+    drawn = re.findall(r'class="([^"]+)"', chart.document)
+    assert all(f".{name}" in STYLE for names in drawn for name in names.split() if name != "tick")
 
 
 def test_training_charts_come_from_the_curves(world):
-    loss, psnr = training_charts(list(world.actors))
+    charts = training_charts(list(world.actors))
+    assert list(charts) == ["loss", "watched_psnr_db"]
+    loss = charts["loss"].figure
     assert "Training loss" in loss and loss.count("<polyline") == 2
-    assert "PSNR" in psnr
+    assert "PSNR" in charts["watched_psnr_db"].figure
+    assert training_charts([world.real])["loss"].title == "Training loss: real/p00"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import json
 import re
 
+import cv2
+import numpy as np
 import pytest
 
 from ntop.config.sections import EvaluateConfig
@@ -65,7 +67,8 @@ def test_metrics_hold_every_key_and_the_known_values(results):
 
 
 def test_the_report_is_one_file_with_its_sections(results):
-    assert sorted(path.name for path in results.iterdir()) == ["metrics.json", "report.html"]
+    found = sorted(path.name for path in results.iterdir())
+    assert found == ["exhibits", "metrics.json", "report.html"]
     page = (results / "report.html").read_text()
     anchors = re.findall(r'<section id="(\w+)"', page)
     assert anchors == [
@@ -73,6 +76,26 @@ def test_the_report_is_one_file_with_its_sections(results):
     ]  # fmt: skip
     assert len(re.findall(r"<img ", page)) == 2 * 6 + 2 * (9 + 4) + 3 * 4
     assert "http:" not in page and "https:" not in page
+
+
+def test_the_exhibits_are_pictures_curves_and_tables(results):
+    assert sorted(path.name for path in (results / "exhibits").iterdir()) == [
+        "contents-joints_in_frame.svg", "contents-joints_visible.svg", "contents-pose.svg",
+        "contents-statistics.html", "contents-subject_size.svg",
+        "run-costs.html", "run-left_out.html",
+        "scores-studio-plain-PSNR_against_truth.svg",
+        "scores-studio-plain-mask_IoU_against_truth.svg",
+        "training-real-p00-loss.svg", "training-real-p00-watched_frames.svg",
+        "training-studio-plain-loss.svg", "training-studio-plain-watched_frames.svg",
+        "views-real-p00-h1.2_r1.0.jpg", "views-studio-plain-h1.2_r1.0.jpg",
+    ]  # fmt: skip
+    for path in (results / "exhibits").glob("*.jpg"):
+        sheet = cv2.imread(str(path))
+        assert max(sheet.shape) <= 1600  # Snakemake's report crops larger ones
+        assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 1000
+    costs = (results / "exhibits/run-costs.html").read_text()
+    assert "<td>train</td><td>2</td><td>0.0061</td>" in costs
+    assert "GPU" not in costs
 
 
 def test_a_missing_or_foreign_folder_is_an_error(world, tmp_path):

@@ -1,7 +1,9 @@
 """What Snakemake plans, without running a stage."""
 
+import json
 import re
 import shutil
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -157,6 +159,31 @@ class TestAfterTheCampaign:
         stages.write_text(stages.read_text().replace('(6, "annotate", 1)', '(6, "annotate", 99)'))
         done = campaign.snakemake("-n", "--quiet", "rules", *TEST_CONFIG, PYTHONPATH=str(tmp_path))
         assert set(planned(done.stdout)) - {"all", "total"} == {"annotate", "assemble", "evaluate"}
+
+    def test_snakemakes_report_holds_sheets_curves_and_tables_with_labels(self, campaign, tmp_path):
+        done = campaign.snakemake("--report", str(tmp_path / "report.zip"), *TEST_CONFIG)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "Missing metadata" not in done.stderr
+        with zipfile.ZipFile(tmp_path / "report.zip") as archive:
+            page = archive.read("report/report.html").decode()
+            sizes = {Path(item.filename).name: item.file_size for item in archive.infolist()}
+        decode, found = json.JSONDecoder().raw_decode, {}
+        for name in ("categories", "results"):
+            found[name], _ = decode(page, page.index(f"var {name} = {{") + len(f"var {name} = "))
+        assert {name: set(subs) for name, subs in found["categories"].items()} == {
+            "Nine views": {"raw", "studio"}, "Training": {"raw", "studio"}, "Scores": {"studio"},
+            "Dataset": {"test"}, "Run": {"test"},
+        }  # fmt: skip
+        labels = {Path(path).name: item["labels"] for path, item in found["results"].items()}
+        assert labels["views-raw-loose-h1.0_r0.5.jpg"] == {"actor": "raw/loose", "rig": "h1.0_r0.5"}
+        assert labels["training-raw-loose-training_rays.svg"]["curve"] == "training rays"
+        assert labels["scores-studio-plain-mask_IoU_against_truth.svg"]["actor"] == "studio/plain"
+        assert labels["run-costs.html"] == {"table": "costs"}
+        assert labels["contents-subject_size.svg"] == {"figure": "subject size"}
+        assert len(labels) == 19 and all(labels.values())
+        assert all(item["caption"].strip() for item in found["results"].values())
+        assert all(sizes[name] > 500 for name in labels)  # the files themselves are in the zip
+        assert "An annotated top-view fisheye pose dataset" in page
 
     def test_every_job_left_a_log_and_a_benchmark(self, campaign):
         logs = {p.relative_to(campaign.folder / "logs").with_suffix("")

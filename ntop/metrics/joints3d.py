@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ntop.conventions import DataError
+
 MM_PER_M = 1000.0
 PCK_THRESHOLD_MM = 150.0
 # 31 thresholds; with "error < t" the first can never count, so a perfect AUC is 30/31 = 0.968
@@ -43,7 +45,21 @@ class PoseScores:
 
 
 def score_poses(predicted: Joints, reference: Joints) -> PoseScores:
-    """All scores of a set of poses."""
+    """All scores of a set of poses.
+
+    Raises:
+        DataError: there is no pose, or a coordinate is not finite: every mean would be NaN.
+    """
+    if not len(predicted):
+        raise DataError("3D scores of no pose: expected at least one predicted and reference pose")
+    for name, joints in (("predicted", predicted), ("reference", reference)):
+        bad = np.argwhere(~np.isfinite(joints).all(-1))
+        if len(bad):
+            sample, joint = bad[0]
+            raise DataError(
+                f"{name} joint {joint} of sample {sample} is {joints[sample, joint]} m, expected "
+                f"finite numbers ({len(bad)} joints are not); leave such poses out or mend them"
+            )
     errors_mm = joint_errors_mm(root_aligned(predicted, reference), reference)
     alignment = procrustes_aligned(predicted, reference)
     kept = ~alignment.degenerate

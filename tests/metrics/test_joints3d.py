@@ -1,4 +1,4 @@
-"""3D scores: analytic cases, invariances, mirrored and degenerate skeletons (NUMERICS test 36)."""
+"""3D scores: analytic cases; degenerate skeletons are case 36 of tests/numerics."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ import torch
 
 from ntop.geometry.rotations import matrix_from_axis_angle
 from ntop.metrics.joints3d import (
-    joint_errors_mm,
     procrustes_aligned,
     root_aligned,
     score_poses,
@@ -52,29 +51,6 @@ def test_pck_and_auc_count_strictly_below():
     assert scores.auc == pytest.approx(expected)
 
 
-def test_similarities_vanish_under_procrustes_even_far_away():
-    reference = skeletons()
-    moved = similarity(reference, scale=1.7, axis_angle=[0.3, -2.0, 1.0], shift=[1000.0, -5, 3])
-    aligned = procrustes_aligned(moved, reference)
-    assert not aligned.degenerate.any()
-    # 1e-6 mm: float64 with an offset of 1e6 mm, centred first
-    assert joint_errors_mm(aligned.joints, reference).max() < 1e-6
-
-
-def test_score_is_invariant_under_similarities_of_the_prediction():
-    reference, predicted = skeletons(seed=1), skeletons(seed=2)
-    plain = score_poses(predicted, reference).pa_mpjpe_mm
-    moved = similarity(predicted, scale=0.5, axis_angle=[1.0, 0.2, -0.4], shift=[1, 2, 3])
-    assert score_poses(moved, reference).pa_mpjpe_mm == pytest.approx(plain, rel=1e-9)
-
-
-def test_a_mirrored_skeleton_is_not_forgiven():
-    reference = skeletons()
-    mirrored = reference * [-1.0, 1.0, 1.0]
-    errors = joint_errors_mm(procrustes_aligned(mirrored, reference).joints, reference)
-    assert errors.mean() > 100  # mm
-
-
 def test_the_best_similarity_beats_random_ones():
     reference, predicted = skeletons(1, seed=3), skeletons(1, seed=4)
     best = ((procrustes_aligned(predicted, reference).joints - reference) ** 2).sum()
@@ -87,43 +63,6 @@ def test_the_best_similarity_beats_random_ones():
             shift=reference.mean((0, 1)),
         )
         assert ((other - reference) ** 2).sum() >= best - 1e-12
-
-
-@pytest.mark.parametrize("kind", ["line", "equal", "one_joint", "two_joints", "nan", "inf"])
-def test_degenerate_clouds_are_flagged_and_left_out(kind):
-    reference = skeletons(3)
-    predicted = reference.copy()
-    match kind:
-        case "line":
-            predicted[1] = np.linspace(-1, 1, 24)[:, None] * [1.0, 2.0, 0.5]
-        case "equal":
-            predicted[1] = 0.25
-        case "one_joint":
-            predicted, reference = predicted[:, :1], reference[:, :1]
-        case "two_joints":
-            predicted, reference = predicted[:, :2], reference[:, :2]
-        case "nan":
-            predicted[1, 3, 0] = np.nan
-        case "inf":
-            predicted[1, 3, 0] = np.inf
-    alignment = procrustes_aligned(predicted, reference)
-    whole = kind in ("one_joint", "two_joints")
-    assert alignment.degenerate.tolist() == ([True] * 3 if whole else [False, True, False])
-    if kind not in ("nan", "inf"):
-        assert np.isfinite(alignment.joints).all()
-        scores = score_poses(predicted, reference)
-        assert scores.num_degenerate == (3 if whole else 1)
-        if not whole:
-            assert scores.pa_mpjpe_mm == pytest.approx(0.0, abs=1e-9)
-
-
-def test_planar_clouds_are_aligned_exactly():
-    reference = skeletons(2)
-    reference[..., 2] = 0
-    moved = similarity(reference, scale=2.0, axis_angle=[0.0, 0.0, 1.2], shift=[1, 1, 0])
-    aligned = procrustes_aligned(moved, reference)
-    assert not aligned.degenerate.any()
-    assert joint_errors_mm(aligned.joints, reference).max() < 1e-6
 
 
 def test_root_alignment_moves_whole_skeletons():

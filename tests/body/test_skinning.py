@@ -105,16 +105,6 @@ def test_skinning_equals_its_double_loop_twin():
     np.testing.assert_allclose(pose_joints(model, pose), joints, atol=1e-12)
 
 
-def test_float32_chain_stays_within_a_micrometre_of_float64():
-    model = load_body_model()
-    pose = random_pose(4, scale=0.4)
-    exact = pose_body(model, pose).vertices
-    single = BodyPose(*(getattr(pose, name).float() for name in pose.__dataclass_fields__))
-    rough = pose_body(model, single).vertices
-    assert rough.dtype == torch.float32
-    assert (rough - exact).norm(dim=-1).max() < 4e-6  # metres: a chain of ten float32 products
-
-
 def test_leading_dimensions_are_free():
     model, pose = small_model(), random_pose(2, 3)
     batch = pose_body(model, pose)

@@ -5,7 +5,6 @@ import torch
 
 from ntop.geometry.rotations import (
     axis_angle_from_matrix,
-    cross_matrix,
     matrix_from_axis_angle,
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -18,22 +17,6 @@ def vectors(angle, dtype=torch.float64):
     generator = torch.Generator().manual_seed(3)
     axes = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     return (axes / axes.norm(dim=-1, keepdim=True) * angle).to(dtype)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_matrix_equals_the_matrix_exponential(angle):
-    r = vectors(angle)
-    expected = torch.linalg.matrix_exp(cross_matrix(r))
-    assert torch.allclose(matrix_from_axis_angle(r), expected, atol=5e-15)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_float32_rotations_are_orthogonal(angle):
-    matrices = matrix_from_axis_angle(vectors(angle, torch.float32))
-    identity = torch.eye(3)
-    assert (matrices @ matrices.transpose(-1, -2) - identity).abs().max() < 1e-6
-    exact = matrix_from_axis_angle(vectors(angle, torch.float32).double())
-    assert (matrices - exact).abs().max() < 6e-7  # NUMERICS table 6
 
 
 @pytest.mark.parametrize("angle", ANGLES)

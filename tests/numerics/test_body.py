@@ -397,8 +397,9 @@ def align_1_plus_cos(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def improper(rotation: np.ndarray) -> float:
     """How far a matrix is from a proper rotation; NaN stays NaN."""
-    defect = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    return float(max(defect, abs(np.linalg.det(rotation) - 1)))
+    with np.errstate(invalid="ignore"):
+        defect = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        return float(max(defect, abs(np.linalg.det(rotation) - 1)))
 
 
 LIMB_DIRECTIONS = (

@@ -20,7 +20,7 @@ from ntop.field.rendering import PosedAvatar, pose_avatar
 VOXEL_M = 0.012
 SHELL_M = 0.036  # inside and outside of the surface
 RAW_PER_M = 3000.0  # the surface is a millimetre thick
-FADE_PER_M = 400.0  # of raw colour: from bright to dark within 8 mm below the surface
+FADE_PER_M = 60.0  # of raw colour: 3 grey levels per millimetre below the surface
 CELL_M = 0.024
 
 

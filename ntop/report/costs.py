@@ -141,7 +141,9 @@ def _row(cost: StageCost, num_images: int, *, with_gpus: bool) -> tuple[str, ...
 
 
 def _hours(seconds: float | None) -> str:
-    return _shown(None if seconds is None else seconds / 3600)
+    if seconds is None or seconds >= 36000:
+        return _shown(None if seconds is None else seconds / 3600)
+    return f"{seconds / 3600:.4f}"
 
 
 def _shown(value: float | None) -> str:

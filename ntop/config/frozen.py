@@ -17,13 +17,13 @@ from ntop.conventions import ConfigError
 
 
 class Estimate(Section):
-    """What the campaign will take; hours are of one core, or of one GPU where jobs ask for one."""
+    """What the campaign will take; hours are those of its jobs, one after the other."""
 
     images: int
     sets: int
     jobs: int
     hours: float
-    gpu_hours: float
+    gpu_hours: float = Field(description="Of jobs that ask for GPUs, times how many they ask for.")
     gigabytes: float
     minutes_per_job: float = Field(description="Of the longest render job.")
     basis: str = Field(description="Where pace and sizes come from.")

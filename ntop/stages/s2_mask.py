@@ -43,6 +43,7 @@ from ntop.storage.atomic import atomic_folder
 from ntop.storage.files import check_files, record_files
 from ntop.storage.frames import iterate_frames
 from ntop.storage.images import read_matte, write_matte
+from ntop.storage.pace import Pace
 from ntop.storage.tables import Row, read_table, write_table
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -71,6 +72,11 @@ class Job:
     def wants_keypoints(self) -> bool:
         """Whether the source leaves the keypoints to this stage."""
         return "keypoints2d" not in self.config.provides
+
+    @property
+    def seeks_person(self) -> bool:
+        """Whether frames are looked at by the networks, before they are segmented."""
+        return self.wants_keypoints or self.config.method == "mediapipe"
 
 
 def main(config: MaskConfig, capture: Path, packages: Path, out: Path) -> None:
@@ -105,8 +111,10 @@ def segment_capture(job: Job) -> None:
     views = [list(g) for _, g in groupby(rows, key=lambda row: (row["action"], row["view"]))]
     # One thread per core: networks and OpenCV compute outside Python's lock, and what comes out
     # of a view does not depend on the other views.
+    usable = sum(not row["reason"] for row in rows)
+    pace = Pace("mask", total=usable * (job.seeks_person + job.wants_masks), unit="looks")
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        done = list(pool.map(lambda view: process_view(job, view), views))
+        done = list(pool.map(lambda view: process_view(job, view, pace), views))
     masks = [mask for view, _ in done for mask in view]
     points = [point for _, view in done for point in view]
     if job.wants_masks:
@@ -120,14 +128,14 @@ def segment_capture(job: Job) -> None:
         write_table(points, schema=schemas.KEYPOINTS2D, path=out / "keypoints2d.parquet")
 
 
-def process_view(job: Job, rows: list[Row]) -> tuple[list[Row], list[Row]]:
+def process_view(job: Job, rows: list[Row], pace: Pace) -> tuple[list[Row], list[Row]]:
     """Mask and keypoint rows of one view's frames; writes the mattes.
 
     The frames are decoded twice: to follow the person and learn what is behind him, then to
     segment.
     """
     usable = [row for row in rows if not row["reason"]]
-    sightings, plate = _follow(job, usable)
+    sightings, plate = _follow(job, usable, pace)
     votes = sum((s.pose.votes for s in sightings if s.pose), np.zeros(len(GROUPS), int))
     # continuity named left and right alike in all frames; the majority of all looks says which
     order = naming(votes < 0)[:NUM_KEYPOINTS]
@@ -136,7 +144,9 @@ def process_view(job: Job, rows: list[Row]) -> tuple[list[Row], list[Row]]:
     if job.wants_masks:
         segment = _segmenter(job, usable, plate)
         frames = zip(_in_time(job, usable), sightings, strict=True)
-        masks = [_mask_row(job, row, segment(image, s)) for (row, image), s in frames]
+        for (row, image), sighting in frames:
+            masks.append(_mask_row(job, row, segment(image, sighting)))
+            pace.step()
     for row in rows:
         if row["reason"]:
             lost = Sighting(None, row["reason"])
@@ -147,12 +157,12 @@ def process_view(job: Job, rows: list[Row]) -> tuple[list[Row], list[Row]]:
     return masks, points
 
 
-def _follow(job: Job, rows: list[Row]) -> tuple[list[Sighting], Plate | None]:
+def _follow(job: Job, rows: list[Row], pace: Pace) -> tuple[list[Sighting], Plate | None]:
     """The person in every frame of a view, in time, and the scene behind him.
 
     Without need for the network nobody is sought, and the scene is unknown.
     """
-    if not rows or not (job.wants_keypoints or job.config.method == "mediapipe"):
+    if not rows or not job.seeks_person:
         return [Sighting(None, "")] * len(rows), None
     detector, landmarks = job.config.detector, job.config.landmarks
     networks = Networks(Network(job.packages / detector), Network(job.packages / landmarks))
@@ -166,6 +176,7 @@ def _follow(job: Job, rows: list[Row]) -> tuple[list[Sighting], Plate | None]:
         if sighting.pose and index % stride == 0:
             person = sighting.pose.person_in_frame()
             scene.add(image, person, radius_px=edge_radius_px(sighting.pose))
+        pace.step()
     return sightings, scene.finish()
 
 

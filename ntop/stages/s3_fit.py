@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from ntop.body.fitting.actor import ActorFit, fit_actor
+from ntop.body.fitting.actor import ActorFit, fit_actor, num_descents
 from ntop.body.fitting.contours import View, matte_border
 from ntop.body.fitting.quality import (
     body_height_m,
@@ -41,6 +41,7 @@ from ntop.storage.bodies import body_rows
 from ntop.storage.cameras import write_cameras
 from ntop.storage.files import check_files, record_files
 from ntop.storage.images import read_matte
+from ntop.storage.pace import Pace
 from ntop.storage.provenance import file_sha256, provenance, write_provenance
 from ntop.storage.recordings import read_recordings
 from ntop.storage.tables import read_table, write_table
@@ -83,14 +84,17 @@ def main(config: FitConfig, capture: Path, keypoints: Path, masks: Path, out: Pa
         )
     training = [recording.without_views(config.held_out_views) for recording in recordings]
     mattes = _matte_paths(masks, held_out_views=config.held_out_views)
+    views = _views(training, mattes) if config.silhouettes else []
+    pace = Pace("fit", total=num_descents(with_views=bool(views)), unit="steps")
     fit = fit_actor(
         model,
         landmarks,
         landmark_rays(training, landmarks, min_confidence=config.min_confidence),
-        _views(training, mattes) if config.silhouettes else [],
+        views,
         frames=[(r.action, frame) for r in recordings for frame in r.frames],
         outlier_px=config.outlier_px,
         settings=FitSettings(landmark_px=config.landmark_spread_px),
+        on_descent=pace.step,
     )
     if config.refine_cameras:
         recordings = place_on_bodies(

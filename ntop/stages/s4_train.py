@@ -21,6 +21,7 @@ from ntop.body.model import load_body_model
 from ntop.captures.training_views import Tables, training_views
 from ntop.config.sections import TrainConfig
 from ntop.field.avatar import save_avatar
+from ntop.field.devices import kernel_words
 from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
@@ -56,6 +57,7 @@ def main(
     """
     torch.set_num_threads(1)  # the kernels have their own threads
     check_files(capture, cameras.parent, masks.parent, bodies.parent)
+    sys.stderr.write(f"train: {kernel_words()}\n")
     tables = Tables(capture / "frames.parquet", cameras, masks, bodies)
     inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
     values = config.model_dump(mode="json")

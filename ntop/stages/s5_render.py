@@ -24,6 +24,7 @@ from ntop.body.skinning import BodyPose
 from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
+from ntop.field.devices import kernel_words
 from ntop.field.rendering import Rendering, pose_avatar, render_view
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.stages import VERSIONS
@@ -73,6 +74,7 @@ def main(
     torch.set_num_threads(1)  # posing is small; the kernels have their own threads
     check_files(avatar, packages / CLIPS)
     check_files(bodies.parent, only={bodies.name})
+    sys.stderr.write(f"render: {kernel_words()}\n")
     keys = [SetKey(source, actor, action, rig, frame) for frame in sorted(frames)]
     rows = [row for row in read_bodies(bodies) if (row["source"], row["actor"]) == (source, actor)]
     if not rows:

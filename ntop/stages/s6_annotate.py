@@ -9,6 +9,7 @@ from ntop.storage import schemas
 from ntop.storage.files import check_files
 from ntop.storage.images import read_depth, read_parts, read_rgba
 from ntop.storage.remedies import remedy
+from ntop.storage.pace import paced
 from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row, read_table, write_table
 
@@ -19,7 +20,7 @@ def main(config: AnnotateConfig, renders: Path, out: Path) -> None:  # noqa: ARG
     rows = read_table(renders / "renders.parquet", schema=schemas.RENDER)
     annotated = [
         annotate_view(row, read_view(row, folder=renders), camera=fisheye_camera(row))
-        for row in rows
+        for row in paced(rows, what="annotate", total=len(rows), unit="images")
     ]
     write_table(annotated, schema=schemas.KEYPOINTS, path=out)
 

@@ -21,6 +21,7 @@ from ntop.storage.coco import COCO17, SMPL24, CocoWriter, coco_writer
 from ntop.storage.files import file_row, files_writer, find_damage, raise_damage, read_records
 from ntop.storage.links import link_or_copy
 from ntop.storage.manifest import ManifestWriter, manifest_writer
+from ntop.storage.pace import paced
 from ntop.storage.provenance import code_sha256, json_sha256
 from ntop.storage.remedies import FILES_NAME, remedy
 from ntop.storage.renders import IMAGE_FOLDERS, set_key
@@ -81,7 +82,8 @@ def main(
                 for skeleton, name in COCO_NAMES.items()
                 for split in SPLITS
             }
-            for shard in in_order(shards):
+            ordered = in_order(shards)
+            for shard in paced(ordered, what="assemble", total=len(ordered), unit="shards"):
                 rows = add_shard(
                     shard, actors=actors, folder=folder, manifest=manifest, coco=coco, totals=totals
                 )

@@ -53,6 +53,7 @@ from ntop.report.training import training_charts
 from ntop.report.truth import score_truth, truth_comparison, truth_values
 from ntop.storage.atomic import atomic_folder
 from ntop.storage.files import check_files
+from ntop.storage.pace import paced
 
 Values = dict[str, float | None]
 
@@ -90,7 +91,8 @@ def main(
     actors = actor_folders(captures, mattes=mattes, bodies=bodies, avatars=avatars)
     check_files(*captures, *mattes, *bodies, *avatars)
     assembled = Dataset.read(dataset)
-    reports = {actor.name: report_actor(config, assembled, actor) for actor in actors}
+    in_turn = paced(actors, what="evaluate", total=len(actors), unit="actors")
+    reports = {actor.name: report_actor(config, assembled, actor) for actor in in_turn}
     record = read_dataset_record(assembled)
     values = mean_values([report.values for report in reports.values()])
     values |= dataset_values(assembled)

@@ -11,6 +11,7 @@ from ntop.config.run import Run, load_files
 from ntop.conventions import VIEWS, ConfigError
 from ntop.storage.atomic import write_bytes
 from ntop.storage.benchmarks import read_usage
+from ntop.tools.gpus import Gpus, asked_gpus
 
 # where nothing was measured yet: the demo on one core (benchmarks/results/demo.json)
 DEFAULT_VIEWS_PER_S = 1.3
@@ -36,13 +37,16 @@ def main(
     minutes_per_job: float = 30.0,
     views_per_s: float | None = None,
     refreeze: bool = False,
+    profile: Path | None = None,
+    set_resources: list[str] | None = None,
 ) -> None:
     """Freeze the plan of a campaign into the JSON file `out`, and print what it will take.
 
     Name the file as `plan` in the configuration; the workflow then takes its shards from it. The
     size of shards is chosen when the file is made, so that a render job lasts `minutes_per_job`
     at the pace that earlier jobs in `directory` had (or `views_per_s`); later calls add new
-    sequences and keep it. `refreeze` starts anew.
+    sequences and keep it. `refreeze` starts anew. Give `profile` and `set_resources` as to
+    Snakemake: GPU-hours are the hours of the jobs that ask for GPUs there, times their number.
 
     Raises:
         ConfigError: the configuration cannot be used, a planned sequence has changed, or the
@@ -53,14 +57,15 @@ def main(
         raise ConfigError(f"minutes_per_job {minutes_per_job}: expected {JOB_MINUTES[0]:.0f} to 60")
     run = load_files(configfile or [], directory=directory, frozen=False)
     pace = measured_pace(run, directory=directory, views_per_s=views_per_s)
+    gpus = asked_gpus(directory, profile=profile, words=set_resources)
     known = read_plan(out) if out.exists() and not refreeze else None
-    plan = frozen_plan(run, pace, known=known, minutes_per_job=minutes_per_job)
+    plan = frozen_plan(run, pace, gpus=gpus, known=known, minutes_per_job=minutes_per_job)
     write_bytes(out, (plan.model_dump_json(indent=1) + "\n").encode())
     sys.stdout.write("\n".join(describe(plan, out, known=known)) + "\n")
 
 
 def frozen_plan(
-    run: Run, pace: Pace, *, known: FrozenPlan | None, minutes_per_job: float
+    run: Run, pace: Pace, *, gpus: Gpus, known: FrozenPlan | None, minutes_per_job: float
 ) -> FrozenPlan:
     """The plan of a run; shards of a plan that is known already stay as they are.
 
@@ -83,7 +88,7 @@ def frozen_plan(
         sets_per_shard=size,
         rigs=tuple(rigs),
         runs=dict(sorted(runs.items())),
-        estimate=estimate(run, size, pace),
+        estimate=estimate(run, size, pace, gpus=gpus),
     )
 
 
@@ -92,7 +97,7 @@ def best_size(pace: Pace, minutes_per_job: float) -> int:
     return max(1, round(60 * minutes_per_job * pace.views_per_s / len(VIEWS)))
 
 
-def estimate(run: Run, sets_per_shard: int, pace: Pace) -> Estimate:
+def estimate(run: Run, sets_per_shard: int, pace: Pace, *, gpus: Gpus) -> Estimate:
     """What the whole campaign takes with shards of this size."""
     render = run.config.render.model_copy(update={"sets_per_shard": sets_per_shard})
     sized = replace(run, config=run.config.model_copy(update={"render": render}))
@@ -101,16 +106,18 @@ def estimate(run: Run, sets_per_shard: int, pace: Pace) -> Estimate:
     num_sets = sum(len(job.frames) for job in shards)
     images = num_sets * len(VIEWS)
     longest = max((len(job.frames) for job in shards), default=0)
-    trainings = sum(job.stage == "train" for job in jobs)
+    render_s = images / pace.views_per_s
+    train_s = sum(job.stage == "train" for job in jobs) * pace.train_s
     return Estimate(
         images=images,
         sets=num_sets,
         jobs=len(jobs),
-        hours=round((images / pace.views_per_s + trainings * pace.train_s) / 3600, 2),
-        gpu_hours=0.0,  # the rules ask for no GPU
+        hours=round((render_s + train_s) / 3600, 2),
+        gpu_hours=round((render_s * gpus.render + train_s * gpus.train) / 3600, 2),
         gigabytes=round(images * pace.bytes_per_image / 1e9, 2),
         minutes_per_job=round(longest * len(VIEWS) / pace.views_per_s / 60, 1),
-        basis=pace.basis,
+        basis=f"{pace.basis}; GPUs a job: {gpus.train:g} to train, {gpus.render:g} to render, by "
+        f"{gpus.origin}",
     )
 
 
@@ -149,7 +156,7 @@ def describe(plan: FrozenPlan, path: Path, *, known: FrozenPlan | None) -> list[
         f"  {plan.sets_per_shard} sets a shard"
         + (", kept" if known else ", chosen now")
         + f": render jobs of up to {figures.minutes_per_job} minutes",
-        f"  {figures.hours} core-hours, {figures.gpu_hours} GPU-hours, {figures.gigabytes} GB",
+        f"  {figures.hours} hours of jobs, {figures.gpu_hours} GPU-hours, {figures.gigabytes} GB",
         f"  by {figures.basis}",
         f"use it: --config plan={path}, or `plan: {path}` in the configuration",
     ]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from ntop.body.fitting import actor, solver
 from ntop.body.fitting.actor import fit_actor, neighbours
 from ntop.body.fitting.contours import View, matte_border
 from ntop.body.fitting.initial import initial_pose
@@ -110,13 +111,27 @@ def rays_of(recording: Recording) -> LandmarkRays:
     return landmark_rays([recording], landmarks, min_confidence=0.3)
 
 
-def fitted(recording: Recording, views: list[View] | None = None):
+def fitted(recording: Recording, views: list[View] | None = None, **options):
     # unrelated poses: frames ten apart are not smoothed
     return fit_actor(
         MODEL, landmarks_on(MODEL, recording.skeleton), rays_of(recording), views or [],
         frames=[("move", 10 * frame) for frame in recording.frames],
-        outlier_px=15.0, settings=SETTINGS,
+        outlier_px=15.0, settings=SETTINGS, **options,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("with_views", [False, True])
+def test_the_announced_steps_are_taken(monkeypatch, with_views):
+    for name, steps in (("POINT_STEPS", 3), ("RAY_STEPS", 4), ("CONTOUR_STEPS", 2)):
+        monkeypatch.setattr(solver, name, steps)
+        monkeypatch.setattr(actor, name, steps)
+    poses = some_poses(3)
+    recording = record(poses, ring(4), skeleton="smpl24", noise_px=0.0)
+    mask = outline(poses, 0, recording.cameras[0])
+    views = [View(0, recording.cameras[0], matte_border(mask.astype(np.float32)))] * with_views
+    taken = []
+    fitted(recording, views, on_descent=lambda: taken.append(1))
+    assert len(taken) == actor.num_descents(with_views=with_views) == 7 + 8 * with_views
 
 
 def joint_errors_mm(fit, poses: BodyPose) -> torch.Tensor:

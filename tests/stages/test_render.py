@@ -123,6 +123,7 @@ def test_sigterm_ends_at_a_set_border_with_143_and_the_next_run_goes_on(shop):
     root = str(Path(s5_render.__file__).parents[2])
     environment = os.environ | {"PYTHONPATH": root}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr.readline().startswith("render: CPU kernels on ")  # once
     assert "set 1/12" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     rest = process.stderr.read()

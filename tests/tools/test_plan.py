@@ -7,7 +7,7 @@ from ntop.config.plan import planned_jobs
 from ntop.config.run import load_files
 from ntop.conventions import ConfigError
 from ntop.tools import plan
-from tests.tools.run_folder import RunFolder
+from tests.tools.run_folder import ROOT, RunFolder
 
 HEADER = "source\tactor\taction\tfirst\tlast\tstep\tuse\tmotion\n"
 
@@ -109,6 +109,48 @@ def test_a_plan_that_is_not_there_says_how_to_make_it(folder):
 def test_jobs_shorter_or_longer_than_sensible_are_refused(folder):
     with pytest.raises(ConfigError, match="expected 10 to 60"):
         freeze(folder, minutes_per_job=1)
+
+
+def test_gpu_hours_are_those_of_jobs_that_ask_for_gpus(folder):
+    """3600 images at 1 view/s are an hour; the training's 200 s are assumed."""
+    write_tables(folder, actors=1, actions=1, frames=200)
+    folder.write("profiles/default/config.yaml", "rerun-incomplete: true\n")
+    cluster = "set-resources:\n  train: {gpu: 2, runtime: 9}\n  render: {runtime: 60 * attempt}\n"
+    profile = folder.write("cluster/config.yaml", cluster).parent
+    hours = 200 / 3600
+
+    def gpu_hours(**options):
+        found = freeze(folder, views_per_s=1.0, **options)["estimate"]
+        assert found["hours"] == 1.06
+        return found["gpu_hours"], found["basis"].rpartition("by ")[2]
+
+    assert gpu_hours() == (0, "the rules")
+    assert gpu_hours(profile=profile) == (round(2 * hours, 2), str(profile))
+    words = ["train:gpu=1", "render:gpu=1", "render:mem_mb=100"]
+    assert gpu_hours(set_resources=words) == (1.06, "--set-resources")
+    # as in Snakemake, the command line replaces the profile's lines, and profiles/default wins
+    assert gpu_hours(profile=profile, set_resources=["render:gpu=1"]) == (1.0, "--set-resources")
+    default = folder.write("profiles/default/config.yaml", "set-resources: ['render:gpu=3']\n")
+    assert gpu_hours(profile=profile) == (3.0, str(default.parent))
+
+
+def test_the_shipped_profiles_ask_for_no_gpu(folder):
+    write_tables(folder, actors=1, actions=1, frames=5)
+    assert freeze(folder, profile=ROOT / "profiles/slurm")["estimate"]["gpu_hours"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"profile": Path("nowhere")}, r"cannot read profile nowhere/config.yaml: No such file"),
+        ({"set_resources": ["render:gpu=1 * attempt"]}, "render asks for gpu='1 . attempt'"),
+        ({"set_resources": ["render=1"]}, "'render=1' is no resource"),
+    ],
+)
+def test_gpus_that_cannot_be_read_are_named(folder, options, message):
+    write_tables(folder, actors=1, actions=1, frames=5)
+    with pytest.raises(ConfigError, match=message):
+        freeze(folder, **options)
 
 
 def test_a_paper_sized_campaign_stays_under_five_thousand_jobs(folder):

@@ -1,5 +1,6 @@
 """The fit of one actor over all his recordings: landmarks, then silhouettes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,6 +10,9 @@ from torch import Tensor
 from ntop.body.fitting.contours import View, candidate_vertices, match_contours
 from ntop.body.fitting.observations import LandmarkRays, triangulated_landmarks
 from ntop.body.fitting.solver import (
+    CONTOUR_STEPS,
+    POINT_STEPS,
+    RAY_STEPS,
     BodyFit,
     FitProblem,
     FitSettings,
@@ -52,10 +56,12 @@ def fit_actor(
     frames: list[tuple[str, int]],
     outlier_px: float,
     settings: FitSettings,
+    on_descent: Callable[[], None] = lambda: None,
 ) -> ActorFit:
     """One shape and a pose per frame; `frames` are (action, frame), ascending.
 
-    `views` hold the mattes' borders (none: landmarks alone decide).
+    `views` hold the mattes' borders (none: landmarks alone decide). `on_descent` is called as often
+    as `num_descents` says.
 
     Raises:
         DataError: no frame shows shoulders and hips to two cameras.
@@ -67,6 +73,7 @@ def fit_actor(
         blend=blend_landmarks(model, landmarks),
         neighbours=neighbours(frames),
         settings=settings,
+        on_descent=on_descent,
     )
     fit = fit_landmarks(problem, rays, found)
     if views:
@@ -77,6 +84,11 @@ def fit_actor(
             contours = match_contours(full, fit.pose, views, candidates=candidates, reach_m=reach_m)
             fit = fit_contours(problem, fit, rays, contours)
     return _measured(problem, fit, found)
+
+
+def num_descents(*, with_views: bool) -> int:
+    """How many steps down a fit takes, with mattes or without."""
+    return POINT_STEPS + RAY_STEPS + with_views * len(CONTOUR_REACH_M) * CONTOUR_STEPS
 
 
 def neighbours(frames: list[tuple[str, int]]) -> Tensor:

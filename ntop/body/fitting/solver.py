@@ -67,6 +67,7 @@ class FitProblem:
         model: reduced body whose vertices are the joints and the contour candidates.
         landmarks: the skeleton; blend: its points as blends of the bones.
         neighbours: triples of frames that follow each other in number.
+        on_descent: called after every step of a descent.
     """
 
     model: BodyModel
@@ -74,6 +75,7 @@ class FitProblem:
     blend: BlendedLandmarks
     neighbours: Int[Tensor, "triple 3"]
     settings: FitSettings
+    on_descent: Callable[[], None] = lambda: None
 
 
 def fit_landmarks(problem: FitProblem, rays: LandmarkRays, found: Triangulation) -> BodyFit:
@@ -165,6 +167,7 @@ def _maximise(
         cost = observation_cost(posed, points) + _prior_cost(problem, fit, posed, offsets)
         cost.backward()
         optimiser.step()
+        problem.on_descent()
     with torch.no_grad():
         fit = current()
         pose = BodyPose(*(getattr(fit.pose, field.name).clone() for field in fields(BodyPose)))

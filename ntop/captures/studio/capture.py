@@ -26,6 +26,7 @@ from ntop.storage.atomic import write_bytes
 from ntop.storage.cameras import write_cameras
 from ntop.storage.frames import STILL
 from ntop.storage.images import eight_bit, write_matte
+from ntop.storage.pace import paced
 from ntop.storage.png import encode_png
 from ntop.storage.tables import Row, write_table
 
@@ -123,7 +124,8 @@ def _record(
     plates = {view: empty_room(camera) for view, camera in cameras.items()}
     for view, plate in plates.items():
         _write_picture(plate, out / f"plates/{sequence.action}_{view}.png")
-    for index, frame in enumerate(sequence.frames):
+    what, total = f"capture: {sequence.action}", len(sequence.frames)
+    for index, frame in enumerate(paced(sequence.frames, what=what, total=total, unit="frames")):
         posed = pose_actor(actor, one_pose(poses, index))
         scene = light_actor(actor, posed, light)
         for view, camera in cameras.items():

@@ -1,6 +1,6 @@
 """The truth from above: what perfect rendering and annotation would give for each set."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.storage import schemas
 from ntop.storage.images import write_depth, write_parts, write_rgba
 from ntop.storage.keys import SetKey
+from ntop.storage.pace import paced
 from ntop.storage.renders import body_columns, render_row
 from ntop.storage.tables import write_table
 
@@ -28,7 +29,7 @@ class TruePose:
 
 
 def write_truth(
-    poses: Iterable[TruePose],
+    poses: Sequence[TruePose],
     actor: Actor,
     *,
     source: str,
@@ -44,7 +45,7 @@ def write_truth(
     """
     radii = measure_limbs(actor)
     renders, visibilities = [], []
-    for item in poses:
+    for item in paced(poses, what="capture: truth", total=len(poses), unit="sets"):
         posed = pose_actor(actor, item.pose)
         scene = light_actor(actor, posed, light)
         body = body_columns(actor.model, item.pose)

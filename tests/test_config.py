@@ -7,11 +7,13 @@ import jsonschema
 import pytest
 import yaml
 
+from ntop.config.run import load_files
 from ntop.config.tables import Actor, Sequence, read_tsv
 from ntop.config.whole import body_model_of, check_tables, read_config, stage_section
 from ntop.conventions import ConfigError
 
 ROOT = Path(__file__).parents[1]
+STUDIO = "config/studio.yaml"
 SHIPPED = yaml.safe_load((ROOT / "config/config.yaml").read_text())
 
 
@@ -140,3 +142,10 @@ def test_editors_find_the_schema_and_the_shipped_files_follow_it(name):
     jsonschema.validate(yaml.safe_load(path.read_text()), schema)
     with pytest.raises(jsonschema.ValidationError, match="stepz"):
         jsonschema.validate({"train": {"stepz": 1}}, schema)
+
+
+def test_the_demo_and_the_studio_never_replace_each_others_results():
+    """Results are kept by source and actor: one name must not stand for two recipes."""
+    runs = [load_files([ROOT / name], directory=ROOT) for name in ("config/config.yaml", STUDIO)]
+    demo, studio = ({(row.source, row.actor) for row in run.actors} for run in runs)
+    assert demo and studio and not demo & studio

@@ -22,6 +22,18 @@ until left=$(ntop orphans); do
   sleep 1
 done
 snakemake --unlock --cores "$cores" --quiet all "$@" >/dev/null
+# Snakemake counts jobs; this says every minute how fast the stages are and how long they will take.
+# It does not hold the lock, and ends with this script.
+files=() takes_files=false
+for word in "$@"; do
+  case $word in
+    --configfile | --configfiles) takes_files=true ;;
+    -*) takes_files=false ;;
+    *) if $takes_files; then files=("${files[@]:---configfile}" "$word"); fi ;;
+  esac
+done
+ntop status "${files[@]}" --every-s "${NTOP_PROGRESS_S:-60}" 9>&- &
+trap 'kill $! 2>/dev/null || true' EXIT
 snakemake --cores "$cores" --quiet progress "$@"
 echo
 echo "dataset: $PWD/results/7_assemble/$dataset"

@@ -9,7 +9,7 @@ from ntop.config.plan import NUMBERS
 from ntop.conventions import VIEWS
 from ntop.tools.progress import Progress, log_tail, seconds_left, seconds_per_unit
 
-NUM_SLOWEST, NUM_LINES = 5, 6
+NUM_SLOWEST, NUM_LINES, NUM_AT_WORK = 5, 6, 8
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,15 @@ class Slow:
     seconds: float
     seconds_per_set: float
     times_median: float
+
+
+@dataclass(frozen=True)
+class AtWork:
+    """A running job and the last line of its log: how far it is, its rate and its time left."""
+
+    stage: str
+    key: str
+    last_line: str
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,7 @@ class Summary:
     work_hours_left: float  # of the stages whose pace is known
     hours_left: float  # the same with as many jobs at once as now
     unknown_pace: tuple[str, ...]  # stages with work left that no finished job tells about
+    at_work: tuple[AtWork, ...]  # some of the running jobs
     slowest: tuple[Slow, ...]
     failures: tuple[Failure, ...]
     stopped: tuple[Stopped, ...]
@@ -107,6 +117,7 @@ def summarise(
         work_hours_left=work,
         hours_left=work / at_once,
         unknown_pace=tuple(stage.name for stage in stages if stage.hours_left is None),
+        at_work=_at_work(items, directory),
         slowest=_slowest(shards),
         failures=tuple(
             Failure(i.job.stage, i.job.key, i.job.log, last_lines(log_tail(directory / i.job.log)))
@@ -137,6 +148,15 @@ def _stage(name: str, items: list[Progress]) -> Stage:
         unit="set" if any(item.job.frames for item in items) else "job",
         seconds_per_unit=seconds_per_unit(items),
         hours_left=None if left_s is None else left_s / 3600,
+    )
+
+
+def _at_work(items: list[Progress], directory: Path) -> tuple[AtWork, ...]:
+    running = [item.job for item in items if item.state == "running"][:NUM_AT_WORK]
+    said = [last_lines(log_tail(directory / job.log)) for job in running]
+    return tuple(
+        AtWork(job.stage, job.key, lines[-1] if lines else "nothing said yet")
+        for job, lines in zip(running, said, strict=True)
     )
 
 

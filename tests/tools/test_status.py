@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,8 @@ from ntop.config.files import merge, read_files
 from ntop.config.plan import planned_jobs
 from ntop.config.run import load_files
 from ntop.conventions import ConfigError
-from ntop.tools.status import describe, survey, table
-from tests.tools.run_folder import RunFolder, stand_in_for_squeue
+from ntop.tools.status import brief, describe, survey, table
+from tests.tools.run_folder import ROOT, RunFolder, stand_in_for_squeue
 
 TEST_CONFIG = Path("config/test.yaml")
 SHARD = "5_render/raw/loose/range"
@@ -205,6 +207,51 @@ def test_a_finished_run_says_so_and_needs_nothing(run):
     summary = look(run)
     assert all(item.done == item.jobs for item in summary.stages)
     assert "left    nothing: all outputs are there" in describe(summary)
+
+
+def test_a_running_job_shows_its_rate_and_its_time_left(run):
+    job = jobs_of(run)["4_train/raw/loose"]
+    run.start(job.output)
+    assert [item.last_line for item in look(run).at_work] == ["nothing said yet"]
+    run.write(job.log, "train: step 7/120, 3.0 steps/s, 38 s left\n\n")
+    run.finish(jobs_of(run)["4_train/studio/plain"], seconds=20)
+    assert "  train raw/loose: train: step 7/120, 3.0 steps/s, 38 s left" in describe(look(run))
+    assert brief(look(run)) == [
+        "ntop: train: 1 of 2 done, 1 running, 20.0 s/job, 20 s of work left",
+        "ntop:   raw/loose: train: step 7/120, 3.0 steps/s, 38 s left",
+        "ntop: 0 of 126 images, left at least 20 s with one job at once; of capture, mask, fit, "
+        "render, annotate, assemble, evaluate no job has ended yet",
+    ]
+
+
+def follower(run, *words: str, every_s: str = "0.1") -> list[str]:
+    files = ["--configfile", str(run.folder / TEST_CONFIG)]
+    place = ["--directory", str(run.folder), "--every-s", every_s]
+    return [sys.executable, "-m", "ntop.cli", "status", *files, *place, *words]
+
+
+def test_following_says_it_again_until_all_is_done(run):
+    with subprocess.Popen(follower(run), stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        for _ in range(2):
+            assert process.stdout.readline().startswith("ntop: 0 of 126 images, left unknown")
+        for job in jobs_of(run).values():
+            run.finish(job, seconds=1)
+        *_, last = process.stdout.read().splitlines()
+    assert last == "ntop: 126 of 126 images, left nothing: all outputs are there"
+    assert process.returncode == 0
+
+
+def test_following_ends_with_its_shell(run):
+    shell = ["sh", "-c", '"$@" & exec sleep 600', "sh", *follower(run)]
+    with subprocess.Popen(shell, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout.readline().startswith("ntop: 0 of 126 images")
+        process.kill()
+        process.stdout.read()  # ends when nobody has it open any more
+
+
+def test_a_time_that_is_none_is_refused(run, capsys):
+    assert cli.main(["status", "--directory", str(run.folder), "--every-s", "0"]) == 2
+    assert "expected seconds, more than 0" in capsys.readouterr().err
 
 
 def test_status_is_quick_and_writes_nothing(half, capsys):

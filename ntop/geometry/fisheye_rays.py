@@ -16,6 +16,7 @@ from torch import Tensor
 from ntop.geometry.guards import guarded_offsets, guarded_points, require_domain, require_lens
 
 WIDEST = math.pi * (1 - 1e-9)  # the point behind the camera has no single image
+ANTIPODE_Q = 1e-30  # of a direction of order one: straight back, where no lens sees anything
 ANTIPODE = "the direction straight back is imaged as a whole circle"
 
 Gain = Callable[[Tensor, Tensor], Tensor]  # q, z -> r(theta) / h
@@ -77,14 +78,17 @@ def require_fisheye(lens: Intrinsics, *, below: float, why: str) -> None:
     require_domain(lens.model, lens.max_theta, below=below, why=why)
 
 
-def theta_over_h(q: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Ratio theta / h, with its series near the axis, where the quotient is 0/0."""
+def theta_over_h(
+    q: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Ratio theta / h, and theta^2; by series near the axis, where the quotient is 0/0."""
     small = (q < 1e-8 * z * z) & (z > 0)
     z_safe = torch.where(small, z, torch.ones_like(z))
-    h_safe = torch.where(small | (q == 0), torch.ones_like(q), q).sqrt()
-    return torch.where(
-        small, (1 - q / (z_safe * z_safe) / 3) / z_safe, torch.atan2(h_safe, z) / h_safe
-    )
+    h_safe = torch.where(small | (q < ANTIPODE_Q), torch.ones_like(q), q).sqrt()
+    tangent2 = torch.where(small, q, torch.zeros_like(q)) / (z_safe * z_safe)
+    theta = torch.atan2(h_safe, z)
+    ratio = torch.where(small, (1 - tangent2 / 3) / z_safe, theta / h_safe)
+    return ratio, torch.where(small, tangent2 * (1 - 2 * tangent2 / 3), theta * theta)
 
 
 def sinc_and_cosine(

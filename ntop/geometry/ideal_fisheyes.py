@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ntop.geometry.fisheye_rays import (
     ANTIPODE,
+    ANTIPODE_Q,
     WIDEST,
     offsets_within,
     projected,
@@ -70,7 +71,7 @@ class Equidistant(IdealFisheye):
         self, points_camera: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
         """Pixels of camera-frame points; seen = within `max_theta` of the axis."""
-        return projected(points_camera, self, theta_over_h)
+        return projected(points_camera, self, lambda q, z: theta_over_h(q, z)[0])
 
     def unproject(
         self, pixels: Float[Tensor, "*batch 2"]
@@ -103,11 +104,13 @@ class Equisolid(IdealFisheye):
         self, pixels: Float[Tensor, "*batch 2"]
     ) -> tuple[Float[Tensor, "*batch 3"], Bool[Tensor, "*batch"]]:
         """Unit directions through pixels; valid = inside the image circle of `max_theta`."""
-        offsets, valid = offsets_within(pixels, self, rim=2 * math.sin(0.5 * self.max_theta))
+        # towards 180 degrees theta moves ever faster than the radius: no rounding in between
+        rim = 2 * math.sin(0.5 * self.max_theta)
+        offsets, valid = offsets_within(pixels.double(), self, rim=rim)
         half_sine = 0.25 * (offsets * offsets).sum(-1)  # squared
-        half_cosine = (1 - half_sine).clamp(min=torch.finfo(pixels.dtype).tiny).sqrt()
-        cosine = 1 - 2 * half_sine
-        return torch.cat([offsets * half_cosine[..., None], cosine[..., None]], -1), valid
+        half_cosine = (1 - half_sine).sqrt()
+        rays = torch.cat([offsets * half_cosine[..., None], 1 - 2 * half_sine[..., None]], -1)
+        return rays.to(pixels.dtype), valid
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def _double_half_sine_over_h(q: Tensor, z: Tensor) -> Tensor:
     n = (q + z * z).sqrt()
     ahead = z >= 0
     front = (2 / (n * torch.where(ahead, n + z, torch.ones_like(n)))).sqrt()
-    q_safe = torch.where(ahead | (q == 0), torch.ones_like(q), q)
+    q_safe = torch.where(ahead | (q < ANTIPODE_Q), torch.ones_like(q), q)
     behind = (2 * torch.where(ahead, torch.ones_like(n), n - z) / (n * q_safe)).sqrt()
     return torch.where(ahead, front, behind)
 
@@ -151,5 +154,5 @@ def _double_half_tangent_over_h(q: Tensor, z: Tensor) -> Tensor:
     n = (q + z * z).sqrt()
     ahead = z >= 0
     front = 2 / torch.where(ahead, n + z, torch.ones_like(n))
-    q_safe = torch.where(ahead | (q == 0), torch.ones_like(q), q)
+    q_safe = torch.where(ahead | (q < ANTIPODE_Q), torch.ones_like(q), q)
     return torch.where(ahead, front, 2 * (n - z) / q_safe)

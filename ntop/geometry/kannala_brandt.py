@@ -86,5 +86,5 @@ class KannalaBrandt:
         return torch.cat([offsets * gain[..., None], cosine[..., None]], -1), valid
 
     def _gain(self, q: Tensor, z: Tensor) -> Tensor:
-        over_h = theta_over_h(q, z)
-        return over_h * radial_polynomial.ratio(over_h * over_h * q, self.distortion)
+        ratio, theta2 = theta_over_h(q, z)
+        return ratio * radial_polynomial.ratio(theta2, self.distortion)

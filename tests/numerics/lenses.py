@@ -23,7 +23,8 @@ TUM_VI = (0.0034823894022493, 0.00071503484521623, -0.0020532361418706, 0.000202
 WIDE_ANGLE = (-0.0285, 0.0096, -0.0053, 0.0008)  # as action cameras have
 BARREL = (-0.12, 0.0, 0.0, 0.0)  # folds at 95 degrees
 STRONG = (9.0, 0.0, 0.0, 0.0)  # OpenCV's own stress case (opencv PR 17454)
-FOLDING = (-0.5, 0.1, -0.02, 0.003)  # folds at 60 degrees
+OPENCV_23961 = (-0.99137234, -0.1205525, 0.36863644, -1.0656211)  # folds at 32 degrees
+FOLDING = (-0.5, 0.1, -0.02, 0.003)  # folds at 57 degrees
 
 
 def family(focal: float, *, max_theta: float = WIDE, size: int = SIZE) -> list[Fisheye]:
@@ -47,11 +48,10 @@ def pinhole(focal: float) -> Pinhole:
     return Pinhole(focal, focal, CENTRE, CENTRE, SIZE, SIZE, (-0.05, 0.14, 1e-3, -2e-3, 0.01))
 
 
-def directions(theta: Tensor, azimuth: Tensor) -> Tensor:
+def directions(theta: Tensor | float, azimuth: Tensor) -> Tensor:
     """Unit vectors at angle theta from the axis."""
-    return torch.stack(
-        [theta.sin() * azimuth.cos(), theta.sin() * azimuth.sin(), theta.cos()], -1
-    )
+    theta, azimuth = torch.broadcast_tensors(torch.as_tensor(theta, dtype=torch.float64), azimuth)
+    return torch.stack([theta.sin() * azimuth.cos(), theta.sin() * azimuth.sin(), theta.cos()], -1)
 
 
 def azimuths(count: int) -> Tensor:

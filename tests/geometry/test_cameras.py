@@ -1,13 +1,11 @@
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from ntop.geometry.cameras import Equidistant, Pinhole
-
-GOLDEN = Path(__file__).parents[1] / "golden" / "cycles_fisheye_rays.npz"from tests.numerics.lenses import directions, family
+from tests.numerics.lenses import directions, family
 
 FISHEYE = Equidistant(1000 / math.pi, 500.0, 500.0, 1000, 1000, max_theta=math.radians(170))
 DISTORTED = Pinhole(1681.0, 1680.0, 533.0, 948.6, 1088, 1920, (-0.05, 0.14, 1e-3, -2e-3, 0.01))

@@ -1,4 +1,4 @@
-"""Things many tests need: small real videos."""
+"""Things many tests need: small real videos, and one undisturbed tiny campaign."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.workflow.project import Project
+
 VideoWriter = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def campaign(tmp_path_factory):
+    """The tiny campaign, run once without any disturbance."""
+    project = Project(tmp_path_factory.mktemp("campaign"))
+    done = project.run()
+    assert done.returncode == 0, done.stdout + done.stderr
+    return project
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A project folder of its own for every workflow test, and one undisturbed tiny campaign."""
+"""A project folder of its own for every workflow test."""
 
 import pytest
 
@@ -8,12 +8,3 @@ from tests.workflow.project import Project
 @pytest.fixture
 def project(tmp_path):
     return Project(tmp_path)
-
-
-@pytest.fixture(scope="session")
-def campaign(tmp_path_factory):
-    """The tiny campaign, run once without any disturbance."""
-    project = Project(tmp_path_factory.mktemp("campaign"))
-    done = project.run()
-    assert done.returncode == 0, done.stdout + done.stderr
-    return project

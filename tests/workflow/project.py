@@ -15,14 +15,24 @@ class Project:
     """A copy of the workflow (not of the package) in which Snakemake runs."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.environment = os.environ | {
-            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-        }
+        self._use(folder)
         for name in ("workflow", "profiles", "config"):
             shutil.copytree(ROOT / name, folder / name)
         for name in ("Snakefile", "environment.yml"):
             shutil.copy(ROOT / name, folder)
+
+    @classmethod
+    def existing(cls, folder: Path) -> "Project":
+        """A project that has been made, and perhaps run, before."""
+        project = cls.__new__(cls)
+        project._use(folder)
+        return project
+
+    def _use(self, folder: Path) -> None:
+        self.folder = folder
+        self.environment = os.environ | {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        }
 
     def snakemake(self, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

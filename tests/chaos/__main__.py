@@ -1,0 +1,78 @@
+"""`make chaos`: many trials, and their table.
+
+    python -m tests.chaos --trials 60 --seed 1 --jobs 2 --out docs/chaos
+
+A piece of a long campaign is written to a JSON file; `--merge` puts pieces together.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+from tests.chaos.catalogue import QUICK, SLOW, deal, lacking
+from tests.chaos.slurm import SLURM_KINDS, slurm_trials
+from tests.chaos.table import write_table
+from tests.chaos.trial import Outcome, run_trial
+from tests.slurm.cluster import slurm_is_installed
+from tests.workflow.project import Project
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="make chaos", description=__doc__)
+    parser.add_argument("--trials", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
+    parser.add_argument("--finished", type=Path, help="a finished tiny campaign, else one is run")
+    parser.add_argument("--out", type=Path, default=Path("docs/chaos"))
+    parser.add_argument("--merge", type=Path, nargs="*", default=[], help="JSON of earlier pieces")
+    options = parser.parse_args()
+    for kind in [*QUICK, *SLOW]:
+        if said := lacking(kind):
+            print(f"left out: {kind.name}, {kind.stage}: {said}")
+    outcomes = [Outcome(**row) for path in options.merge for row in json.loads(path.read_text())]
+    with tempfile.TemporaryDirectory(prefix="ntop-chaos-") as place:
+        finished = reference(options.finished, Path(place)) if options.trials else None
+        outcomes += campaign(options, finished, Path(place))
+    write_table(outcomes, options.out)
+    lost = [outcome for outcome in outcomes if not outcome.survived]
+    print(f"{len(outcomes) - len(lost)} of {len(outcomes)} survived")
+    return 1 if lost else 0
+
+
+def reference(folder: Path | None, place: Path) -> Project:
+    """The undisturbed campaign."""
+    if folder is not None:
+        return Project.existing(folder)
+    (place / "finished").mkdir()
+    project = Project(place / "finished")
+    done = project.run()
+    if done.returncode != 0:
+        sys.exit(done.stdout + done.stderr)
+    return project
+
+
+def campaign(options: argparse.Namespace, finished: Project | None, place: Path) -> list[Outcome]:
+    """All trials of this call, in the order of their numbers."""
+    if finished is None:
+        return []
+    num_slurm = min(len(SLURM_KINDS), options.trials // 10) if slurm_is_installed() else 0
+    deck = deal(options.trials - num_slurm, options.seed)
+
+    def attempt(numbered: tuple[int, tuple]) -> Outcome:
+        number, (kind, seed) = numbered
+        outcome = run_trial(number, kind, seed, finished=finished, place=place)
+        print(json.dumps(asdict(outcome)), flush=True)
+        return outcome
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        outcomes = list(pool.map(attempt, enumerate(deck, start=1)))
+    first = len(deck) + 1
+    return outcomes + slurm_trials(num_slurm, options.seed, first, finished=finished, place=place)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,8 +8,8 @@ from ntop.conventions import MASK_ALPHA, DataError
 from ntop.storage import schemas
 from ntop.storage.files import check_files
 from ntop.storage.images import read_depth, read_parts, read_rgba
-from ntop.storage.remedies import remedy
 from ntop.storage.pace import paced
+from ntop.storage.remedies import remedy
 from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row, read_table, write_table
 

@@ -1,6 +1,5 @@
-"""The real networks on a real frame, where the packages were fetched; choices without them."""
+"""The real networks on real frames (fetched by `conftest.py`); choices without them."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,37 +17,31 @@ from ntop.masks.segmentation import segment_person
 from ntop.masks.tracking import Networks, follow_person
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = Path(os.environ.get("NTOP_PACKAGES", ROOT / "data" / "packages"))
 REFERENCE = ROOT / "config" / "reference_masks" / "balancing_cam04.json"
 LEFT_HIP, RIGHT_HIP = 23, 24
 
 
-def video_of(view):
-    found = sorted(PACKAGES.glob(f"**/*BalancingTrial/videos/{view}.mp4"))
-    return found[0] if found else None
-
-
-needs_packages = pytest.mark.skipif(
-    not (PACKAGES / MaskConfig().detector).exists() or video_of("cam02") is None,
-    reason=f"no fetched packages in {PACKAGES} (set NTOP_PACKAGES, or run `ntop fetch`)",
-)
-
-
 @pytest.fixture(scope="module")
-def networks():
+def networks(packages):
     config = MaskConfig()
-    return Networks(Network(PACKAGES / config.detector), Network(PACKAGES / config.landmarks))
+    return Networks(Network(packages / config.detector), Network(packages / config.landmarks))
 
 
-def frame_of(view, index):
-    video = cv2.VideoCapture(str(video_of(view)))
-    for _ in range(index + 1):
-        assert video.grab()
-    return cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)
+@pytest.fixture
+def frame_of(packages):
+    """A function that reads frame `index` of a camera of the real recording, RGB."""
+
+    def read(view, index):
+        (path,) = packages.glob(f"pose2sim/**/*BalancingTrial/videos/{view}.mp4")
+        video = cv2.VideoCapture(str(path))
+        for _ in range(index + 1):
+            assert video.grab()
+        return cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)
+
+    return read
 
 
-@needs_packages
-def test_a_reference_frame_is_segmented(networks):
+def test_a_reference_frame_is_segmented(networks, frame_of):
     image = frame_of("cam04", 11)
     sighting = follow_person(networks, image, None)
     found = segment_person(image, sighting, plate=None)
@@ -63,8 +56,7 @@ def test_a_reference_frame_is_segmented(networks):
     assert left < right
 
 
-@needs_packages
-def test_the_bystander_never_becomes_the_person(networks):
+def test_the_bystander_never_becomes_the_person(networks, frame_of):
     image = frame_of("cam02", 0)
     sighting = follow_person(networks, image, None)
     region = sighting.pose.next_region
@@ -77,8 +69,7 @@ def test_the_bystander_never_becomes_the_person(networks):
     assert lost.pose is None and lost.reason
 
 
-@needs_packages
-def test_a_jump_of_the_person_is_refused(networks):
+def test_a_jump_of_the_person_is_refused(networks, frame_of):
     image = frame_of("cam04", 11)
     pose = follow_person(networks, image, None).pose
     elsewhere = replace(pose.next_region, centre_u_px=pose.next_region.centre_u_px + 900)

@@ -19,7 +19,7 @@ from pathlib import Path
 import psutil
 
 MARKS = ".snakemake/incomplete"
-SLURM_LOGS = ".snakemake/slurm_logs"
+SLURM_LOGS = (".snakemake/slurm_logs", "logs/slurm")  # the plugin's own, our profile's
 QUEUED = frozenset({"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SPECIAL_EXIT"})
 
 
@@ -105,7 +105,8 @@ def slurm_queue(directory: Path, marks: list[Mark]) -> list[SlurmJob] | None:
     Asks for the whole queue: another user may have started the run in a shared folder.
     """
     place = str(directory.resolve())
-    was_used = (directory / SLURM_LOGS).is_dir() or any(mark.job_id for mark in marks)
+    was_used = any((directory / folder).is_dir() for folder in SLURM_LOGS)
+    was_used = was_used or any(mark.job_id for mark in marks)
     silent = None if was_used else []
     if shutil.which("squeue") is None:
         return silent

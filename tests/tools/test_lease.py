@@ -187,6 +187,43 @@ def test_small_jobs_spread_first_then_share_but_never_with_a_lease_that_does_not
     assert machine.run(*now, "--", *SHOW).stdout.split()[0] == "0"
 
 
+@pytest.mark.parametrize(
+    ("environment", "seen"),
+    [
+        ({"NTOP_GPU_IDS": "0,1", "NTOP_JOBS_PER_GPU": "2"}, {"0": 2, "1": 2}),
+        # the same command inside a SLURM job, whose GPU is its own
+        ({"SLURM_JOB_ID": "17", "CUDA_VISIBLE_DEVICES": "7"}, {"7": 4}),
+    ],
+)
+def test_snakemakes_jobs_share_gpus_as_told(machine, tmp_path, environment, seen):
+    # nobody ends before all four have begun
+    job = (
+        "echo $CUDA_VISIBLE_DEVICES > $0; until [ $(ls *.begun | wc -l) -eq 4 ]; do sleep 0.1; done"
+    )
+    (tmp_path / "Snakefile").write_text(f"""
+rule all:
+    input: expand("{{n}}.txt", n=range(4))
+
+rule job:
+    output: "{{n}}.txt"
+    resources: gpu=1
+    params: job={job!r}
+    shell: "{sys.executable} -m ntop.cli lease -n {{resources.gpu}} --"
+           " sh -c {{params.job:q}} {{wildcards.n}}.begun && cp {{wildcards.n}}.begun {{output}}"
+""")
+    done = subprocess.run(
+        [sys.executable, "-m", "snakemake", "--cores", "4", "--resources", "gpu=4"],
+        cwd=tmp_path,
+        env=machine.environment | environment,
+        capture_output=True,
+        text=True,
+        timeout=4 * PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert Counter((tmp_path / f"{n}.txt").read_text().strip() for n in range(4)) == seen
+
+
 def test_the_pool_comes_from_the_nearest_source(machine, tmp_path):
     smi = tmp_path / "bin/nvidia-smi"
     smi.parent.mkdir()

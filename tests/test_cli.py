@@ -6,6 +6,7 @@ import pytest
 from ntop import cli
 from ntop.config.sections import RenderConfig, TrainConfig
 from ntop.conventions import ConfigError
+from ntop.stages import VERSIONS
 
 RIGS = {"a": {"height_above_pelvis_m": 1.0, "ring_radius_m": 0.5}}
 
@@ -15,7 +16,8 @@ def entry(config: RenderConfig, out: Path, frames: list[int], motion: str, seed:
 
 
 def test_flags_come_from_the_signature():
-    words = ["--config", json.dumps({"rigs": RIGS, "version": 2}), "--out", "x", "--motion", ""]
+    config = json.dumps({"rigs": RIGS, "version": VERSIONS["render"]})
+    words = ["--config", config, "--out", "x", "--motion", ""]
     values = cli.parse(entry, verb="render", words=[*words, "--frames", "3", "4"])
     assert values["config"].rigs["a"].ring_radius_m == 0.5
     assert values["out"] == Path("x")

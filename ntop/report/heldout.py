@@ -13,6 +13,7 @@ from ntop.report.capture import FrameKey, Recording
 from ntop.report.page import Comparison
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_image, score_table
 from ntop.report.truth import Painter, compared, stored
+from ntop.storage.pace import paced
 
 Renderer = Callable[[BodyPose, Camera], Cutout]  # the avatar in a pose, seen by a camera
 ReferenceMasks = dict[FrameKey, Bool[np.ndarray, "height width"]]
@@ -47,7 +48,8 @@ def score_heldout(
         return None
     photos = recording.pictures(keys)
     scores, pictures = [], []
-    for key in keys:
+    what = f"evaluate: held-out camera of {recording.folders.name}"
+    for key in paced(keys, what=what, total=len(keys), unit="frames"):
         action, frame, view = key
         pose, camera = recording.pose((action, frame)), recording.cameras[action, view]
         image, baseline = render(pose, camera), paint(pose, camera)

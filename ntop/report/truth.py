@@ -20,6 +20,7 @@ from ntop.report.pictures import Picture, error_colours, picture, square_around
 from ntop.report.scores import ImageScores, best_median_worst, mean_scores, score_image, score_table
 from ntop.storage import schemas
 from ntop.storage.images import read_rgba
+from ntop.storage.pace import paced
 from ntop.storage.renders import fisheye_camera, set_key
 from ntop.storage.tables import Row, read_table
 
@@ -53,9 +54,9 @@ def score_truth(dataset: Dataset, actor: ActorFolders, *, paint: Painter) -> Tru
     """
     truth = truth_rows(actor)
     rows, scores = [], []
-    for row in dataset.of(actor):
-        if row["sample_id"] not in truth:
-            continue
+    known = [row for row in dataset.of(actor) if row["sample_id"] in truth]
+    what = f"evaluate: truth of {actor.name}"
+    for row in paced(known, what=what, total=len(known), unit="images"):
         true_row = truth[row["sample_id"]]
         true_rgba, rgba = _true_image(actor, true_row), read_rgba(dataset.image_path(row))
         if not (true_rgba[..., 3] >= MASK_ALPHA).any():

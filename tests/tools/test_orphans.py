@@ -126,12 +126,13 @@ def test_a_run_started_twice_shows_both_jobs(run, capsys, tmp_path, monkeypatch)
     assert "  scancel 7 8\n" in text
 
 
+@pytest.mark.parametrize("logs", [".snakemake/slurm_logs", "logs/slurm"])
 @pytest.mark.parametrize("installed", [True, False])
 def test_a_queue_that_does_not_answer_is_not_taken_for_empty(
-    run, capsys, tmp_path, monkeypatch, installed
+    run, capsys, tmp_path, monkeypatch, installed, logs
 ):
     run.mark(SHARD)
-    run.write(".snakemake/slurm_logs/rule_render/11.log")  # SLURM was used here
+    run.write(f"{logs}/rule_render/11.log")  # SLURM was used here
     path = stand_in_for_squeue(tmp_path / "bin", error="Unable to contact controller", code=1)
     monkeypatch.setenv("PATH", path if installed else str(tmp_path))
     code, text = look(run, capsys)

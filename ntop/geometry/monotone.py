@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 FLAT = 1e-9  # a slope that small counts as zero: nothing is left to invert
+NEGLIGIBLE = 1e-60  # a coefficient without influence below x = 1e10; quotients would overflow
 INSIDE = 1 - 1e-6  # of the fold: the slope stays positive up to the limit
 
 
@@ -38,6 +39,7 @@ def _value(ascending: np.ndarray, at: float) -> float:
 
 
 def _positive_roots(ascending: np.ndarray) -> list[float]:
-    roots = np.roots(ascending[::-1])  # drops leading zeros
+    kept = np.where(np.abs(ascending) < NEGLIGIBLE, 0, ascending)
+    roots = np.roots(kept[::-1])  # drops leading zeros
     real = np.abs(roots.imag) <= 1e-12 * np.abs(roots)
     return [float(root) for root in roots.real[real] if root > 0]

@@ -76,7 +76,8 @@ def load_avatar(folder: Path) -> Avatar:
     """Read an avatar.
 
     Raises:
-        DataError: a file is missing or broken, of another format, or not the one its header names.
+        DataError: a file is missing or broken, of another format, or not the one its header names;
+            or a number in it is not finite, or a length not positive.
     """
     try:
         header = json.loads((folder / HEADER_NAME).read_text())
@@ -102,6 +103,7 @@ def load_avatar(folder: Path) -> Avatar:
             f"avatar {folder}: {len(betas)} betas and values {stored.shape}; expected {NUM_BETAS} "
             f"and {(64 * len(positions), 4)}; train it again"
         )
+    _require_finite(folder, header, stored=stored, light=arrays["light"], betas=betas)
     void = np.zeros((64, 4), np.float32)
     void[:, 0] = header["void_raw"]
     grid = CanonicalGrid(
@@ -112,3 +114,28 @@ def load_avatar(folder: Path) -> Avatar:
         voxel_m=float(header["voxel_m"]),
     )
     return Avatar(grid, arrays["light"], betas, float(header["reach_m"]), int(header["step"]))
+
+
+def _require_finite(
+    folder: Path,
+    header: dict[str, Any],
+    *,
+    stored: Float[np.ndarray, "row 4"],
+    light: Float[np.ndarray, "9 3"],
+    betas: tuple[float, ...],
+) -> None:
+    """Refuse an avatar that a diverged training left: one NaN would spread over whole pixels."""
+    lengths = np.array([header["voxel_m"], header["reach_m"]], float)
+    bad = {
+        "values": int((~np.isfinite(stored)).sum()),
+        "light": int((~np.isfinite(light)).sum()),
+        "betas": int((~np.isfinite(betas)).sum()),
+        "origin_m": int((~np.isfinite(np.array(header["origin_m"], float))).sum()),
+        "lengths": int((~(np.isfinite(lengths) & (lengths > 0))).sum()),
+    }
+    if any(bad.values()):
+        found = ", ".join(f"{count} in {name}" for name, count in bad.items() if count)
+        raise DataError(
+            f"avatar {folder}: numbers that are not finite, or lengths that are not positive: "
+            f"{found}; its training diverged, train it again"
+        )

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
+from ntop.conventions import DataError
 from ntop.field.canonical import CanonicalBody, Occupancy
 from ntop.field.kernels.posing import (
     cell_sheets,
@@ -26,6 +27,7 @@ from ntop.field.kernels.tables import WarpTables
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
+MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
 STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
 
 
@@ -41,7 +43,11 @@ class PoseWarp:
 def pose_warp(
     body: CanonicalBody, model: BodyModel, pose: BodyPose, *, cell_m: float, reach_m: float
 ) -> PoseWarp:
-    """Warp grid around a posed body, `reach_m` beyond its surface; occupancy is still empty."""
+    """Warp grid around a posed body, `reach_m` beyond its surface; occupancy is still empty.
+
+    Raises:
+        DataError: the pose or shape is not finite, or stretches the body beyond `MAX_NODES`.
+    """
     pose = BodyPose(
         betas=pose.betas.double(),
         global_orient=pose.global_orient.double(),
@@ -52,7 +58,14 @@ def pose_warp(
     vertices_world = posed.vertices.numpy()
     radius = reach_m + 1.8 * cell_m  # a cell's farthest corner
     origin = vertices_world.min(0) - radius - 0.5 * cell_m
-    dims = np.ceil((vertices_world.max(0) + radius - origin) / cell_m).astype(np.int64) + 1
+    nodes_along = np.ceil((vertices_world.max(0) + radius - origin) / cell_m) + 1
+    if not nodes_along.prod() <= MAX_NODES:  # also refuses NaN
+        raise DataError(
+            f"a posed body {np.ptp(vertices_world, axis=0).round(2).tolist()} m large: expected "
+            f"finite pose and shape parameters and at most {MAX_NODES:.0e} cells of {cell_m} m "
+            "around it; check betas, pose and units (metres, radians)"
+        )
+    dims = nodes_along.astype(np.int64)
     vertices = vertices_world - origin
     maps, normals = _vertex_maps(body, posed.posed_from_rest.numpy(), vertices, origin)
 

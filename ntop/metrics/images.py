@@ -82,7 +82,15 @@ def tight_window(mask: Bool[np.ndarray, "height width"]) -> Window:
 
 
 def psnr_db(mean_squared_error: float) -> float:
-    """Peak signal-to-noise ratio of values in [0, 1], at most `PSNR_CEILING_DB`."""
+    """Peak signal-to-noise ratio of values in [0, 1], at most `PSNR_CEILING_DB`.
+
+    Raises:
+        DataError: the error is NaN or infinite, as one pixel of the images was.
+    """
+    if not math.isfinite(mean_squared_error):
+        raise DataError(
+            f"mean squared error {mean_squared_error}: a pixel of the compared images is not finite"
+        )
     if mean_squared_error <= 0:
         return PSNR_CEILING_DB
     return min(-10 * math.log10(mean_squared_error), PSNR_CEILING_DB)

@@ -33,6 +33,8 @@ def encode_rgba(
     if rgb.shape[:2] != alpha.shape or rgb.shape[2:] != (3,):
         raise DataError(f"RGBA image: colour {rgb.shape} and alpha {alpha.shape} do not match")
     pixels = np.zeros((*alpha.shape, 4), np.uint8)
+    if not alpha.size:
+        return encode_png(pixels)  # which says what is wrong
     box = _box(alpha, margin=DILATION_PX)  # only there is anything to convert: 4 % of a usual view
     quantised = eight_bit(alpha[box])
     pixels[box][..., :3] = _dilated(eight_bit(rgb[box]), quantised > 0)
@@ -46,7 +48,7 @@ def encode_depth(depth_m: Float[ndarray, "height width"]) -> bytes:
     Raises:
         DataError: a length beyond 6.5535 m, negative or not finite: it would wrap silently.
     """
-    lowest, highest = float(depth_m.min()), float(depth_m.max())
+    lowest, highest = float(depth_m.min(initial=0)), float(depth_m.max(initial=0))
     if not (lowest >= 0 and highest <= DEPTH_LIMIT_M):
         raise DataError(
             f"depth image: values {lowest} .. {highest} m, expected 0 .. {DEPTH_LIMIT_M:.4f} m; "
@@ -114,7 +116,17 @@ def read_matte(path: Path) -> Float[ndarray, "height width"]:
 
 
 def eight_bit(values: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape"]:
-    """Values in [0, 1] as 0..255, rounded to nearest (half to even) and clipped."""
+    """Values in [0, 1] as 0..255, rounded to nearest (half to even) and clipped.
+
+    Raises:
+        DataError: a value is NaN or infinite: it would become an arbitrary grey.
+    """
+    if not np.isfinite(values).all():
+        count = int((~np.isfinite(values)).sum())
+        raise DataError(
+            f"image of {values.shape}: {count} values are not finite, expected 0 .. 1; the stage "
+            "that computed them is at fault"
+        )
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from isal import isal_zlib
 
+from ntop.conventions import DataError
+
 LEVEL = 1  # level 6 saves a tenth of the bytes for twice the time
 STRATEGY = zlib.Z_RLE  # of noisy differences, an eighth smaller and a fifth faster than matching
 FILTER_UP = 2  # the difference to the row above
@@ -23,8 +25,14 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def encode_png(pixels: np.ndarray) -> bytes:
-    """PNG bytes of (H, W) or (H, W, 3 or 4) uint8, or (H, W) uint16; RGB order."""
+    """PNG bytes of (H, W) or (H, W, 3 or 4) uint8, or (H, W) uint16; RGB order.
+
+    Raises:
+        DataError: there is no pixel, which PNG cannot say.
+    """
     height, width = pixels.shape[:2]
+    if not pixels.size:
+        raise DataError(f"image of {width}x{height} px: expected at least one pixel")
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     big_endian = pixels.astype(pixels.dtype.newbyteorder(">"), copy=False)
     lines = np.ascontiguousarray(big_endian).view(np.uint8).reshape(height, -1)

@@ -21,6 +21,9 @@ def body_columns(model: BodyModel, pose: BodyPose) -> Row:
 
     Labels never go below float64: float32 joints are off by 1e-7 m, a hundredth of a micro-pixel
     that the round trip through JSON would then have to excuse.
+
+    Raises:
+        DataError: a parameter is not finite, or so large that a joint is not.
     """
     exact = BodyPose(
         betas=pose.betas.double(),
@@ -29,6 +32,11 @@ def body_columns(model: BodyModel, pose: BodyPose) -> Row:
         transl=pose.transl.double(),
     )
     body = pose_body(model, exact)
+    if not (body.joints.isfinite().all() and exact.betas.isfinite().all()):
+        raise DataError(
+            f"a body at {exact.transl.tolist()} m: {int((~body.joints.isfinite()).sum())} joint "
+            "coordinates are not finite; check pose and shape (metres, radians)"
+        )
     return {
         "betas": exact.betas.tolist(),
         "global_orient_rad": exact.global_orient.tolist(),

@@ -175,8 +175,7 @@ def test_32_a_pose_wrapped_by_a_turn_is_the_same_body(dtype, margin):
         pose_body(model, BodyPose(*(v.to(dtype) for v in vars(p).values()))).vertices
         for p in (pose, other)
     )
-    limit = {torch.float64: 1e-6, torch.float32: 4e-6}[dtype]  # f32: 24 angles near 2 pi, rounded
-    margin.at_most("mesh", float((one - two).norm(dim=-1).max()), limit, "m")
+    margin.at_most("mesh", float((one - two).norm(dim=-1).max()), 1e-6, "m")
 
 
 def test_32_motions_turn_the_short_way_between_poses_on_either_side_of_pi(margin):
@@ -287,16 +286,15 @@ class Skin:
         _, vertex = cKDTree(self.vertices).query(self.points)
         return np.stack([self.way_back(n, v)[0] for n, v in enumerate(vertex)])
 
-    def best_root_mm(self, count: int) -> tuple[np.ndarray, int]:
-        """Over all roots (skin through the point) the smallest error; how many have several."""
+    def best_root_mm(self, count: int) -> np.ndarray:
+        """Over all roots (skin through the point) the smallest error."""
         near = cKDTree(self.vertices).query_ball_point(self.points[:count], 0.03)
-        best, several = np.empty(count), 0
+        best = np.empty(count)
         for n, candidates in enumerate(near):
             found = [self.way_back(n, v) for v in candidates]
             roots = np.array([place for place, distance in found if distance < 1e-9])
             best[n] = 1000 * np.linalg.norm(roots - self.truth[n], axis=1).min()
-            several += np.ptp(roots, axis=0).max() > 1e-3
-        return best, several
+        return best
 
 
 def through_grid(warp: PoseWarp, points_world: np.ndarray) -> np.ndarray:
@@ -320,7 +318,7 @@ POINT_LIMIT_MM = 0.1
 def test_33_the_skin_comes_back_where_it_came_from(name, margin):
     skin = Skin(name, count=800)
     fixed = skin.condition <= 100
-    best, _ = skin.best_root_mm(250)
+    best = skin.best_root_mm(250)
     assert np.isfinite(best).all()
     # the map's translation is the skin's own: exact beyond condition 100 as well
     margin.at_most("inverse at a point, best of all roots", best.max(), POINT_LIMIT_MM, "mm")
@@ -378,13 +376,6 @@ def test_33_the_grid_adds_its_interpolation(name, margin):
     margin.at_most(f"warp grid at {name}, share beyond 10 mm", (error > 10).mean(), beyond)
     averaged = np.median(skin.error_mm(skin.averaged)[skin.condition > 1.001])
     margin.mutant_exceeds(f"average of bone inverses at {name}, median", averaged, median, "mm")
-
-
-def test_33_where_forearm_and_upper_arm_overlap_all_roots_are_found(margin):
-    skin = Skin("elbow 150", count=400)
-    best, several = skin.best_root_mm(400)
-    margin.at_most("elbow 150, true root", best.max(), POINT_LIMIT_MM, "mm")
-    assert several == 0  # skin meets skin in curves, which random points miss
 
 
 def align_1_plus_cos(start: np.ndarray, end: np.ndarray) -> np.ndarray:

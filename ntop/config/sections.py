@@ -1,13 +1,15 @@
 """The sections of the stages: what a stage does, never how (threads and folders are the rules')."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ntop.config.base import Section
 from ntop.config.sources import Given, ReferenceMasks, Source
 from ntop.config.tables import Actor, Sequence
+from ntop.geometry.monotone import monotone_limit
 
 
 class RigConfig(Section):
@@ -22,10 +24,39 @@ class ImageConfig(Section):
 
     width_px: int = Field(default=1000, ge=16)
     height_px: int = Field(default=1000, ge=16)
-    focal_px: float | None = Field(
-        default=None, gt=0, description="Pixels per radian; default min(width, height) / pi."
+    lens: Literal["equidistant", "equisolid", "stereographic", "kannala_brandt"] = Field(
+        default="equidistant",
+        description="Radius in the image: theta, 2 sin(theta/2), 2 tan(theta/2), or a polynomial.",
     )
-    max_theta_deg: float = Field(default=90.0, gt=0, lt=180)
+    focal_px: float | None = Field(
+        default=None,
+        gt=0,
+        description="Pixels per radian on the axis; by default 90 degrees lie half the shorter "
+        "side off the centre: min(width, height) / pi for equidistant.",
+    )
+    focal_y_px: float | None = Field(
+        default=None, gt=0, description="Vertical, where pixels are not square; default focal_px."
+    )
+    center_px: tuple[float, float] | None = Field(
+        default=None, description="Principal point (first pixel's centre: 0.5); default the middle."
+    )
+    max_theta_deg: float = Field(
+        default=90.0, gt=0, lt=180, description="Angle from the axis up to which the lens sees."
+    )
+    distortion: tuple[float, float, float, float] = Field(
+        default=(0.0, 0.0, 0.0, 0.0), description="k1 to k4 of kannala_brandt, as in cv2.fisheye."
+    )
+
+    @model_validator(mode="after")
+    def _is_one_to_one(self) -> "ImageConfig":
+        if self.lens != "kannala_brandt" and any(self.distortion):
+            raise ValueError(f"distortion is kannala_brandt's alone, the lens is {self.lens}")
+        limit = math.degrees(monotone_limit(self.distortion))
+        if self.max_theta_deg > limit:
+            raise ValueError(
+                f"max_theta_deg {self.max_theta_deg}: the distortion folds at {limit:.2f} degrees"
+            )
+        return self
 
 
 class CaptureConfig(Section):

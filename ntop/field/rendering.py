@@ -288,11 +288,16 @@ def _trace_pixels(
     settings: RenderSettings,
 ) -> RayRendering:
     directions, valid = camera.rays(torch.from_numpy(pixels))
-    found = trace_rays(posed, camera.center_world, directions, settings=settings)
-    outside = ~valid.numpy()
+    kept = valid.numpy()
+    found = trace_rays(posed, camera.center_world, directions[valid], settings=settings)
+    if kept.all():
+        return found
+    spread = []
     for values in (found.rgb, found.alpha, found.depth_m, found.parts):
-        values[outside] = 0
-    return found
+        everywhere = np.zeros((len(pixels), *values.shape[1:]), values.dtype)
+        everywhere[kept] = values
+        spread.append(everywhere)
+    return RayRendering(*spread, found.evaluations)
 
 
 def _middle(rays: RayRendering) -> Int[np.ndarray, " pixel"]:

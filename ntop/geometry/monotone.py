@@ -11,6 +11,7 @@ import numpy as np
 
 FLAT = 1e-9  # a slope that small counts as zero: nothing is left to invert
 NEGLIGIBLE = 1e-60  # a coefficient without influence below x = 1e10; quotients would overflow
+FARTHEST = 1e8  # of x^2: beyond any angle or tangent that is asked for
 INSIDE = 1 - 1e-6  # of the fold: the slope stays positive up to the limit
 
 
@@ -42,4 +43,4 @@ def _positive_roots(ascending: np.ndarray) -> list[float]:
     kept = np.where(np.abs(ascending) < NEGLIGIBLE, 0, ascending)
     roots = np.roots(kept[::-1])  # drops leading zeros
     real = np.abs(roots.imag) <= 1e-12 * np.abs(roots)
-    return [float(root) for root in roots.real[real] if root > 0]
+    return [float(root) for root in roots.real[real] if 0 < root < FARTHEST]

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ntop.conventions import PIXEL_CENTRE, DataError
+from ntop.conventions import DataError
 from ntop.geometry import radial_polynomial
 from ntop.geometry.guards import guarded_offsets, guarded_points, require_lens
 from ntop.geometry.monotone import monotone_limit
@@ -193,17 +193,6 @@ class Pinhole:
                 torch.stack([across, radial + bend * y * y + 6 * p1 * y + 2 * p2 * x], -1),
             ],
             -2,
-        )
-
-    def opencv_matrix(self) -> Float[Tensor, "3 3"]:
-        """Intrinsic matrix for OpenCV calls: integer pixel centres."""
-        return torch.tensor(
-            [
-                [self.fx, 0.0, self.cx - PIXEL_CENTRE],
-                [0.0, self.fy, self.cy - PIXEL_CENTRE],
-                [0.0, 0.0, 1.0],
-            ],
-            dtype=torch.float64,
         )
 
     def scaled(self, factor: float) -> "Pinhole":

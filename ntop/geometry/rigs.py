@@ -13,7 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ntop.conventions import VIEWS
-from ntop.geometry.cameras import Camera, Equidistant
+from ntop.geometry.cameras import Camera
+from ntop.geometry.fisheyes import Fisheye, fisheye_lens
+from ntop.geometry.ideal_fisheyes import Equidistant
 
 # image right = +x, image up = +y, looking down
 ROTATION_LOOKING_DOWN = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -29,16 +31,28 @@ class Rig:
     height: int
     focal_px: float
     max_theta_rad: float = math.pi / 2
+    model: str = Equidistant.model
+    focal_y_px: float | None = None
+    center_px: tuple[float, float] | None = None
+    distortion: tuple[float, ...] = ()
 
-    def lens(self) -> Equidistant:
-        """The lens all nine cameras share; the principal point is the image's centre."""
-        return Equidistant(
-            focal=self.focal_px,
-            cx=self.width / 2,
-            cy=self.height / 2,
+    def lens(self) -> Fisheye:
+        """The lens all nine cameras share; pixels are square and centred unless told otherwise.
+
+        Raises:
+            DataError: no such model, or parameters that it cannot have.
+        """
+        center = self.center_px or (self.width / 2, self.height / 2)
+        return fisheye_lens(
+            self.model,
+            fx=self.focal_px,
+            fy=self.focal_y_px or self.focal_px,
+            cx=center[0],
+            cy=center[1],
             width=self.width,
             height=self.height,
             max_theta=self.max_theta_rad,
+            distortion=self.distortion,
         )
 
 

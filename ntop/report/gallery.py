@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt8
+import torch
 
 from ntop.body.skeletons import COCO17_NAMES, COCO17_SKELETON, SMPL24_EDGES, SMPL24_NAMES
 from ntop.conventions import MASK_ALPHA
+from ntop.geometry.cameras import pixel_grid
 from ntop.report.inputs import ActorFolders, Dataset
 from ntop.report.page import Sheet
 from ntop.report.pictures import (
@@ -22,6 +24,7 @@ from ntop.report.pictures import (
 )
 from ntop.storage.images import read_depth, read_parts, read_rgba
 from ntop.storage.keys import SetKey
+from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row
 
 COMPASS = (("nw", "n", "ne"), ("w", "centre", "e"), ("sw", "s", "se"))  # north up
@@ -173,7 +176,7 @@ def layers(dataset: Dataset, row: Row) -> tuple[Picture, ...]:
 
 def image_circle(rgba: np.ndarray, row: Row) -> np.ndarray:
     """The image over a disc that marks the lens's field of view."""
-    v, u = np.mgrid[: row["height"], : row["width"]] + 0.5
-    inside = np.hypot(u - row["cx_px"], v - row["cy_px"]) <= row["focal_px"] * row["max_theta_rad"]
+    grid = pixel_grid(row["width"], row["height"], torch.float64)
+    inside = fisheye_camera(row).lens.unproject(grid)[1].numpy()
     colours = np.where(inside[..., None], on_colour(rgba, INSIDE_GREY), OUTSIDE_GREY)
     return colours.astype(np.uint8)

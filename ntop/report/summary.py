@@ -55,8 +55,9 @@ def lead(dataset: Dataset) -> str:
     degrees = 2 * row["max_theta_rad"] * 57.29577951308232
     return (
         f"Dataset “{dataset.name}”: {len(dataset.sets):,} sets, one body pose each, seen by nine "
-        f"equidistant fisheye cameras ({row['width']} × {row['height']} px, {degrees:.0f}°) in "
-        f"{len(rigs)} camera {'setting' if len(rigs) == 1 else 'settings'}, with masks, depth, "
+        f"{row['camera_model'].replace('_', '-')} fisheye cameras "
+        f"({row['width']} × {row['height']} px, {degrees:.0f}°) in {len(rigs)} camera "
+        f"{'setting' if len(rigs) == 1 else 'settings'}, with masks, depth, "
         "body parts, 2D and 3D keypoints and true visibility."
     )
 

@@ -5,7 +5,6 @@ in the work folder by one rename, so that a stopped job goes on at its first unf
 """
 
 import json
-import math
 import shutil
 import sys
 import time
@@ -21,6 +20,7 @@ from ntop.body.authored_motions import named_motion
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.motions import Motion, retarget
 from ntop.body.skinning import BodyPose
+from ntop.config.rigs import configured_rig
 from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
@@ -134,15 +134,7 @@ def rig_of(config: RenderConfig, name: str) -> Rig:
     """
     if name not in config.rigs:
         raise ConfigError(f"render.rigs has no {name!r}, have {sorted(config.rigs)}")
-    image, place = config.image, config.rigs[name]
-    return Rig(
-        height_above_pelvis_m=place.height_above_pelvis_m,
-        ring_radius_m=place.ring_radius_m,
-        width=image.width_px,
-        height=image.height_px,
-        focal_px=image.focal_px or min(image.width_px, image.height_px) / math.pi,
-        max_theta_rad=math.radians(image.max_theta_deg),
-    )
+    return configured_rig(config.rigs[name], config.image)
 
 
 def unusable_frames(keys: list[SetKey], rows: list[Row]) -> list[Row]:

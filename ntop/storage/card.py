@@ -50,7 +50,10 @@ around the mask, in pixels (width×height). Splits are by actor: nobody is in bo
 
 - World: right-handed, metres, +z up. Camera: x right, y down, z forward,
   `X_camera = R (X_world - center_world_m)`, `rotation_camera_from_world` row by row.
-- Lens: equidistant fisheye, `rho = focal_px * theta` up to `max_theta_rad`.
+- Lens: `camera_model` says how the radius in the image follows the angle from the axis, up to
+  `max_theta_rad`. equidistant: `focal_px * theta`; equisolid: `2 focal_px sin(theta / 2)`;
+  stereographic: `2 focal_px tan(theta / 2)`; kannala_brandt: `focal_px * (theta + k1 theta^3 +
+  k2 theta^5 + k3 theta^7 + k4 theta^9)` with `distortion` k1..k4. `focal_y_px` serves the vertical.
 - Pixels are continuous: the first pixel's centre is (0.5, 0.5). The `keypoints` of the COCO files
   alone follow COCO (first centre at 0): ours minus 0.5.
 - Images: sRGB, straight alpha; the person's mask is alpha >= 128.

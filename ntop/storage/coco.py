@@ -54,7 +54,7 @@ SMPL24 = Skeleton("smpl24", SMPL24_NAMES, SMPL24_EDGES, SMPL24_SIGMAS)
 IMAGE_KEYS = (
     "sample_id", "source", "actor", "action", "rig", "view", "frame", "depth_path", "parts_path",
     "camera_model", "focal_px", "cx_px", "cy_px", "max_theta_rad", "center_world_m",
-    "rotation_camera_from_world",
+    "rotation_camera_from_world", "focal_y_px", "distortion",
 )  # fmt: skip
 SMPL_KEYS = ("betas", "global_orient_rad", "body_pose_rad", "transl_m")
 

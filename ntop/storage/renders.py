@@ -7,7 +7,10 @@ import torch
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, coco17_points, pose_body
 from ntop.conventions import DataError
-from ntop.geometry.cameras import Camera, Equidistant
+from ntop.geometry.cameras import Camera
+from ntop.geometry.fisheyes import fisheye_lens
+from ntop.geometry.kannala_brandt import KannalaBrandt
+from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigs import Rig
 from ntop.storage.keys import SetKey
 from ntop.storage.tables import Row
@@ -66,7 +69,7 @@ def render_row(
 ) -> Row:
     """The row of schema RENDER for one view; `body` comes from `body_columns`."""
     lens = camera.lens
-    if not isinstance(lens, Equidistant):
+    if isinstance(lens, Pinhole):
         raise DataError(f"{key} {view}: lens {lens.model!r} in a render table, expected a fisheye")
     return {
         "sample_id": key.sample_id(view),
@@ -81,7 +84,7 @@ def render_row(
         "width": lens.width,
         "height": lens.height,
         "camera_model": lens.model,
-        "focal_px": lens.focal,
+        "focal_px": lens.fx,
         "cx_px": lens.cx,
         "cy_px": lens.cy,
         "max_theta_rad": lens.max_theta,
@@ -93,6 +96,8 @@ def render_row(
         "avatar_sha256": avatar_sha256,
         "background_id": NO_BACKGROUND,
         **body,
+        "focal_y_px": lens.fy,
+        "distortion": list(lens.distortion) if isinstance(lens, KannalaBrandt) else [],
     }
 
 
@@ -104,22 +109,22 @@ def set_key(row: Row) -> SetKey:
 def fisheye_camera(row: dict[str, Any]) -> Camera:
     """The camera of a row of a render table, a manifest or a set file (float64).
 
+    Tables made before lenses could differ lack the last two columns: they are equidistant.
+
     Raises:
-        DataError: another lens model.
+        DataError: an unknown lens model, or parameters that it cannot have.
     """
-    if row["camera_model"] != Equidistant.model:
-        raise DataError(
-            f"camera model {row['camera_model']!r}, expected {Equidistant.model!r}; "
-            "the table was written by another version"
-        )
     return Camera(
-        lens=Equidistant(
-            focal=row["focal_px"],
+        lens=fisheye_lens(
+            row["camera_model"],
+            fx=row["focal_px"],
+            fy=row.get("focal_y_px") or row["focal_px"],
             cx=row["cx_px"],
             cy=row["cy_px"],
             width=row["width"],
             height=row["height"],
             max_theta=row["max_theta_rad"],
+            distortion=tuple(row.get("distortion") or ()),
         ),
         center_world=torch.tensor(row["center_world_m"], dtype=torch.float64),
         rotation=torch.tensor(row["rotation_camera_from_world"], dtype=torch.float64).reshape(3, 3),

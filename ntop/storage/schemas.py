@@ -104,6 +104,11 @@ CURVE = pa.schema(
     ]
 )
 
+# What completes `camera_model`, `focal_px`, `cx_px`, `cy_px`, `max_theta_rad` (decision 0017): the
+# vertical focal length, and k1..k4 of a Kannala-Brandt lens (empty for the others). They came
+# later: a table without them reads as null, which means square pixels and no distortion.
+LENS_COLUMNS = [("focal_y_px", FLOAT64), ("distortion", pa.list_(FLOAT64))]
+
 # One row per rendered view. `alpha_max` is 0 where no body is in view.
 RENDER = pa.schema(
     [
@@ -135,6 +140,7 @@ RENDER = pa.schema(
         *BODY_COLUMNS,
         ("joints3d_world_m", vector(3 * NUM_JOINTS)),
         ("coco17_world_m", vector(51)),
+        *LENS_COLUMNS,
     ]
 )
 
@@ -186,5 +192,6 @@ MANIFEST = pa.schema(
         ("avatar_sha256", STRING),
         ("background_id", STRING),
         ("persons", pa.list_(PERSON)),
+        *LENS_COLUMNS,
     ]
 )

@@ -14,7 +14,7 @@ from ntop.storage.tables import Row
 
 CAMERA_KEYS = (
     "camera_model", "width", "height", "focal_px", "cx_px", "cy_px", "max_theta_rad",
-    "center_world_m", "rotation_camera_from_world",
+    "center_world_m", "rotation_camera_from_world", "focal_y_px", "distortion",
 )  # fmt: skip
 VIEW_KEYS = ("sample_id", "image_path", "depth_path", "parts_path", "image_sha256", "persons")
 # columns that say the same in every view of a set

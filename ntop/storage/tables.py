@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ntop.conventions import DataError
+from ntop.storage import schemas
 from ntop.storage.atomic import atomic_path
 from ntop.storage.remedies import remedy
 
@@ -44,9 +45,21 @@ def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
         table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
+    table = _completed(table, schema)
     if table.schema.names != schema.names:
         raise DataError(
             f"{path}: columns {table.schema.names}, expected {schema.names}; "
             f"it was written by another version: {remedy(path)}"
         )
     return table.cast(schema).to_pylist()
+
+
+def _completed(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The table with the columns that its schema got later, as nulls."""
+    later = [name for name, _ in schemas.LENS_COLUMNS]
+    if [*table.schema.names, *later] != schema.names:
+        return table
+    for name in later:
+        field = schema.field(name)
+        table = table.append_column(field, pa.nulls(len(table), field.type))
+    return table

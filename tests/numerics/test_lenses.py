@@ -17,6 +17,7 @@ from ntop.geometry.ideal_fisheyes import Equidistant, Equisolid, Stereographic
 from ntop.geometry.jacobians import pixel_by_point, ray_by_pixel, solid_angle
 from ntop.geometry.kannala_brandt import KannalaBrandt
 from ntop.geometry.monotone import monotone_limit
+from ntop.geometry.opencv import opencv_parameters
 from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.geometry.rotations import matrix_from_axis_angle
@@ -55,9 +56,9 @@ def test_07_opencv_in_its_domain(margin):
         lens = KannalaBrandt(*focal.tolist(), 500.3, 480.9, 1000, 960, limit, distortion)
         points = random_points(500, half_angle=limit, generator=generator)
         ours, seen = lens.project(points)
-        matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+        matrix, coefficients = (np.array(values) for values in opencv_parameters(lens))
         theirs, _ = cv2.fisheye.projectPoints(
-            points[:, None].numpy(), zero, zero, matrix, k.numpy()
+            points[:, None].numpy(), zero, zero, matrix, coefficients
         )
         theirs = torch.from_numpy(theirs[:, 0])
         assert seen.all()
@@ -68,8 +69,8 @@ def test_07_opencv_in_its_domain(margin):
     points = random_points(1000, half_angle=math.radians(40), generator=generator)
     for lens in (pinhole(1680.0), replace(pinhole(500.0), fy=510.0, cx=477.0)):
         ours, _ = lens.project(points)
-        matrix = lens.opencv_matrix().numpy()
-        theirs, _ = cv2.projectPoints(points.numpy(), zero, zero, matrix, np.array(lens.distortion))
+        parameters = [np.array(values) for values in opencv_parameters(lens)]
+        theirs, _ = cv2.projectPoints(points.numpy(), zero, zero, *parameters)
         shift = np.abs(ours.numpy() - PIXEL_CENTRE - theirs[:, 0]).max()
         margin.at_most("pinhole", float(shift), 1e-6, "px")
     behind = directions(math.radians(100), azimuths(50))

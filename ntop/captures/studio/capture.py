@@ -15,12 +15,12 @@ from ntop.captures.studio.recording import disturbed, grown, misplaced, side_cam
 from ntop.captures.studio.room import empty_room
 from ntop.captures.studio.truth import TruePose, write_truth
 from ntop.captures.studio.views import light_actor, over, see, studio_light
+from ntop.config.rigs import configured_rig
 from ntop.config.sections import CaptureConfig
 from ntop.config.sources import StudioSource
 from ntop.config.tables import Sequence
 from ntop.conventions import ConfigError
 from ntop.geometry.cameras import Camera
-from ntop.geometry.rigs import Rig
 from ntop.storage import schemas
 from ntop.storage.atomic import write_bytes
 from ntop.storage.cameras import write_cameras
@@ -201,19 +201,7 @@ def _write_truth(
     settings = config.source_section
     if not config.rigs:
         raise ConfigError(f"{source}/{actor.name}: truth is asked for, but render.rigs is empty")
-    image = config.image
-    focal_px = image.focal_px or min(image.width_px, image.height_px) / np.pi
-    rigs = {
-        name: Rig(
-            height_above_pelvis_m=rig.height_above_pelvis_m,
-            ring_radius_m=rig.ring_radius_m,
-            width=image.width_px,
-            height=image.height_px,
-            focal_px=focal_px,
-            max_theta_rad=float(np.deg2rad(image.max_theta_deg)),
-        )
-        for name, rig in config.rigs.items()
-    }
+    rigs = {name: configured_rig(place, config.image) for name, place in config.rigs.items()}
     wanted = []
     for sequence in config.sequences:
         if sequence.truth:

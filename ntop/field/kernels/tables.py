@@ -203,18 +203,27 @@ def next_occupied(warp, pose, ray, state):
 
 @device
 def start_ray(warp, pose, origin, direction, step, offset, ray, state):
-    """Fill `ray` and `state` for `next_occupied`: clip the ray to the warp grid's box."""
-    near, far = 0.0, HUGE
+    """Fill `ray` and `state` for `next_occupied`: clip the ray to the warp grid's box.
+
+    A ray with a number that is none, or without a direction, is over before it begins.
+    """
+    near, far, length = 0.0, HUGE, 0.0
     for a in range(3):
         o = origin[a] * warp.inverse_cell
         d = direction[a] * warp.inverse_cell
         inverse = 1 / d if abs(d) > 1 / HUGE else HUGE
         ray[a], ray[3 + a], ray[6 + a] = o, d, inverse
         size = 1.0 * warp.dims[pose, a]
+        length += abs(d)
+        if not (abs(d) < HUGE and abs(o) < HUGE):
+            far = -1.0
+            continue
         if abs(d) > 1 / HUGE:
             t0, t1 = -o * inverse, (size - o) * inverse
             near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
         elif o < 0 or o > size:
             far = -1.0
+    if length == 0:
+        far = -1.0
     ray[9], ray[10], ray[11] = step, offset, far
     state[0] = max(0.0, math.ceil(near / step - offset))

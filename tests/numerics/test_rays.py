@@ -18,10 +18,11 @@ from ntop.field.warp import identity_warp
 from ntop.geometry.cameras import Camera
 from ntop.geometry.fisheyes import fisheye_lens
 from ntop.geometry.ideal_fisheyes import Equidistant
+from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigs import ROTATION_LOOKING_DOWN, Rig, top_view_cameras
 from ntop.geometry.triangulation import camera_centers, camera_rays, triangulate
 from ntop.report.blobs import ball
-from tests.numerics.lenses import family
+from tests.numerics.lenses import directions, family
 
 CELLS = np.array([5, 4, 7])  # of the grid under test: a box of 5 x 4 x 7 cells
 RAY = 12  # numbers that `start_ray` keeps
@@ -244,6 +245,30 @@ def test_16_a_raised_hand_beyond_90_degrees(model, margin):
     margin.at_most("hand off its label", float(np.hypot(*(centroid - label.numpy()))), 0.5, "px")
     right = np.sign(centroid - 200) == np.sign([offset[0], -offset[1]])  # image up is +y
     assert right.all()
+
+
+def test_16_cropping_is_exact_for_every_lens(margin):
+    """Balls ahead, across, at the rim, behind, beside the image: the same image cropped or not."""
+    size, generator = 120, torch.Generator().manual_seed(16)
+    narrow = Pinhole(70.0, 75.0, 50.0, 66.0, size, size, (-0.2, 0.05, 1e-3, -2e-3, 0.0))
+    wide = family(25.0, max_theta=math.radians(140), size=size)
+    plain = RenderSettings(0.001, crop=False, edge_rays=1)
+    theta = math.pi * torch.rand(8, generator=generator, dtype=torch.float64)
+    azimuth = 2 * math.pi * torch.rand(8, generator=generator, dtype=torch.float64)
+    places = directions(theta, azimuth)
+    drawn = 0
+    for lens in (*wide, narrow):
+        # the last one straddles the rim
+        at_rim = directions(lens.max_theta, azimuth[:1])
+        for place in (*(0.25 * places), *(0.1 * places[::3]), *(0.2 * at_rim)):
+            camera = looking_down(lens, (0.0, 0.0, 1.0))
+            posed = ball((place @ camera.rotation + camera.center_world).numpy())
+            cropped_view = render_view(posed, camera, settings=SETTINGS)
+            whole = render_view(posed, camera, settings=plain)
+            shift = float(np.abs(cropped_view.alpha - whole.alpha).max())
+            margin.at_most(f"{lens.model}: crop on against off", shift, 1e-6)
+            drawn += int(whole.alpha.max() > 0.5)
+    assert drawn > 30
 
 
 def test_16_no_ghost_in_the_corners(margin):

@@ -63,6 +63,18 @@ def box_interval(
     return np.maximum(near, 0.0), np.maximum(first, second).min(1)
 
 
+def paper_steps(
+    origin: Float[np.ndarray, " 3"],
+    directions: Float[np.ndarray, "ray 3"],
+    joints: Float[np.ndarray, "joint 3"],
+    *,
+    samples: int = SAMPLES,
+) -> tuple[Float[np.ndarray, " ray"], Float[np.ndarray, " ray"]]:
+    """First sample and distance of samples (metres) of each ray; 0 apart where it misses."""
+    near, far = box_interval(origin, directions, joints)
+    return near, np.where(far > near, (far - near) / (samples - 1), 0.0)
+
+
 def trace_paper_rays(
     posed: PosedAvatar,
     center_world: Float[Tensor, " 3"],
@@ -70,7 +82,7 @@ def trace_paper_rays(
     *,
     joints_world: Float[np.ndarray, "joint 3"],
     samples: int = SAMPLES,
-    jitter: np.random.Generator | None = None,
+    shift: float | Float[np.ndarray, " ray"] = 0.0,
 ) -> PaperRays:
     """Rays from one point with the paper's sampling.
 
@@ -80,17 +92,16 @@ def trace_paper_rays(
         directions_world: Unit length.
         joints_world: The joints around which the box lies.
         samples: Per ray.
-        jitter: Shifts every ray's samples by one random part of a step; None: none, as the paper.
+        shift: Of all samples of a ray, in steps; the paper has none, random numbers are jitter.
     """
     origin = center_world.double().numpy()
     directions = np.ascontiguousarray(directions_world.numpy(), np.float64)
-    near, far = box_interval(origin, directions, joints_world)
-    step = np.where(far > near, (far - near) / (samples - 1), 0.0)
-    shift = np.zeros(len(directions)) if jitter is None else jitter.random(len(directions))
+    near, step = paper_steps(origin, directions, joints_world, samples=samples)
+    shifts = np.ascontiguousarray(np.broadcast_to(shift, len(directions)), np.float64)
     rgb, alpha = np.empty((len(directions), 3)), np.empty(len(directions))
     paper.paper_rays(
         posed.grid.tables(), posed.warp.tables, posed.light, origin - posed.warp.origin_world,
-        directions, near, step, shift, samples, rgb, alpha,
+        directions, near, step, shifts, samples, rgb, alpha,
     )  # fmt: skip
     return PaperRays(rgb, alpha, near, step)
 
@@ -101,7 +112,7 @@ def render_paper_view(
     *,
     joints_world: Float[np.ndarray, "joint 3"],
     pixels: Bool[np.ndarray, "height width"] | None = None,
-    jitter: np.random.Generator | None = None,
+    shift: float = 0.0,
 ) -> PaperView:
     """One view through any lens, one ray through the centre of every pixel that may see the body.
 
@@ -113,7 +124,7 @@ def render_paper_view(
     directions, valid = camera.rays(torch.from_numpy(np.stack([u, v], 1) + PIXEL_CENTRE))
     v, u = v[valid.numpy()], u[valid.numpy()]
     rays = trace_paper_rays(
-        posed, camera.center_world, directions[valid], joints_world=joints_world, jitter=jitter
+        posed, camera.center_world, directions[valid], joints_world=joints_world, shift=shift
     )
     view = PaperView(
         rgb=np.zeros((*mask.shape, 3)),

@@ -22,6 +22,7 @@ MAX_Z = 4.0
 MAX_AMPLITUDE = 0.1  # grey levels
 MIN_PIXELS = 500
 HARMONICS = 3
+ROUNDING = 1 / math.sqrt(12)  # standard deviation of what rounding to whole levels adds
 # other step lengths, as shares of the suspected one's frequency; near 1 and its harmonics none
 DECOYS = np.concatenate([np.linspace(0.55, 0.92, 40), np.linspace(1.08, 1.45, 40)])
 
@@ -31,17 +32,47 @@ class LockIn:
     """What is periodic in the phase: `amplitude` in grey levels (of 255), and its significance.
 
     `z` is the amplitude over the standard deviation of one component of it, as found in the rest
-    of the signal at other periods; noise exceeds 4 in about one of 2,000 images.
+    of the signal at other periods, and as the rounding to eight bits alone would cause it; noise
+    exceeds 4 in about one of 2,000 images.
     """
 
     amplitude: float
     z: float
     pixels: int
 
+
+@dataclass(frozen=True)
+class StripeScores:
+    """Both detectors on two renders of a view, half a step apart; grey levels (of 255)."""
+
+    phase_rms: float
+    amplitude: float
+    z: float
+    pixels: int
+
     @property
-    def striped(self) -> bool:
-        """Whether the stripes are both certain and strong enough to matter."""
-        return self.z >= MAX_Z and self.amplitude >= MAX_AMPLITUDE
+    def met(self) -> bool:
+        """Whether all limits are kept."""
+        return (
+            self.phase_rms <= MAX_PHASE_SHIFT and self.amplitude < MAX_AMPLITUDE and self.z < MAX_Z
+        )
+
+
+def score_pair(
+    first: Float[np.ndarray, "height width 3"],
+    second: Float[np.ndarray, "height width 3"],
+    phase: Float[np.ndarray, "height width"],
+    mask: Bool[np.ndarray, "height width"],
+) -> StripeScores:
+    """Both detectors on two renders whose samples are half a step apart.
+
+    Half their difference holds the stripes' first harmonic and none of the texture, so it is
+    searched for what is periodic in `phase` (of the surface's depth, in periods).
+    """
+    half = (first.astype(np.float64) - second) / 2
+    found = lock_in(half, phase, mask)
+    rms = phase_shift_rms(first, second, mask)
+    return StripeScores(rms, found.amplitude, found.z, found.pixels)
 
 
 def phase_shift_rms(
@@ -81,8 +112,9 @@ def lock_in(
     found = _amplitude(grey, angle)
     # stripes leak into neighbouring periods where depths are few: they are taken out first
     rest = grey - _periodic_part(grey, angle)
-    noise = math.sqrt(np.mean([_amplitude(rest, share * angle) ** 2 for share in DECOYS]) / 2)
-    return LockIn(found, found / noise if noise > 0 else 0.0, count)
+    power = np.mean([_amplitude(rest, share * angle) ** 2 for share in DECOYS]) / 2
+    noise = math.sqrt(power + 2 * ROUNDING**2 / count)
+    return LockIn(found, found / noise, count)
 
 
 def high_passed(

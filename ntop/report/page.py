@@ -75,6 +75,7 @@ class Page:
     sheets: tuple[Sheet, ...] = ()
     heldout: tuple[Comparison, ...] = ()
     truth: tuple[Comparison, ...] = ()
+    stripes: Comparison | None = None
     curves: tuple[Chart, ...] = ()
     statistics: Table | None = None
     costs: tuple[Chart, ...] = ()
@@ -93,6 +94,7 @@ class Page:
             ("views", "Nine views", self.sheets),
             ("heldout", "Held-out camera", self.heldout),
             ("truth", "Truth", self.truth),
+            ("stripes", "Stripes", self.stripes),
             ("training", "Training", self.curves),
             ("statistics", "Contents", self.statistics),
             ("figures", "All figures", self.figures),

@@ -30,21 +30,23 @@ from ntop.metrics.stripes import (
     MAX_PHASE_SHIFT,
     MAX_Z,
     StripeScores,
+    high_passed,
     score_pair,
 )
 from ntop.report.capture import pose_of
 from ntop.report.gallery import DIRECTIONS
 from ntop.report.inputs import ActorFolders, Dataset
 from ntop.report.page import Comparison, Table
-from ntop.report.pictures import Picture, picture, square_around
+from ntop.report.pictures import Picture, Square, picture, square_with
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import fisheye_camera
 
 OPAQUE = 0.99
 BORDER_PX = 2  # of the person, where opacity and colour change together
 PINHOLE_VIEWS = ("centre", "e", "sw")
-CONTRAST = 2.0
-MAX_SIDE_PX = 420
+CROP_PX = 112  # of a picture: small enough that single pixels are seen
+ENLARGED = 3
+DETAIL = 2.5  # how much stronger than in the image detail is shown
 
 
 @dataclass(frozen=True)
@@ -185,9 +187,9 @@ def stripe_comparison(checks: list[StripeCheck]) -> Comparison | None:
             rows.append(_row(f"{check.key.rig} · {lens} · {sampler}", found))
         pictures.append(
             tuple(
-                enhanced(views[sampler], view=view, lens=lens, sampler=sampler)
+                shown
                 for lens, (view, views) in check.shown.items()
-                for sampler in ("ours", "paper")
+                for shown in compared_samplers(views, view=view, lens=lens)
             )
         )
     head = (
@@ -206,24 +208,36 @@ def stripe_comparison(checks: list[StripeCheck]) -> Comparison | None:
     return Comparison(text, tuple(pictures), Table(head, tuple(rows)))
 
 
-def enhanced(shown: SampledView, *, view: str, lens: str, sampler: str) -> Picture:
-    """A view with its contrast raised about its mean, cut to the person."""
-    window = square_around(shown.mask, margin=0.04)
-    name = {"ours": "our sampler", "paper": "the paper's sampler"}[sampler]
-    return picture(
-        window.of(_contrasted(shown)),
-        side_px=MAX_SIDE_PX,
-        alt=f"{name}, {lens}, {DIRECTIONS[view]} camera",
-        caption=f"{name[0].upper() + name[1:]}: {lens}, {DIRECTIONS[view]} camera, contrast "
-        f"raised {CONTRAST:g} times",
+def compared_samplers(
+    views: dict[str, SampledView], *, view: str, lens: str
+) -> tuple[Picture, Picture]:
+    """Ours and the paper's image, detail raised, cut to where the paper's differs most."""
+    window = _telling_window(views["paper"])
+    ours, paper = (
+        picture(
+            np.repeat(np.repeat(window.of(_raised(views[name])), ENLARGED, 0), ENLARGED, 1),
+            alt=f"{words}, {lens}, {DIRECTIONS[view]} camera",
+            caption=f"{words}: {lens}, {DIRECTIONS[view]} camera, detail raised {DETAIL:g} times",
+        )
+        for name, words in (("ours", "Our sampler"), ("paper", "The paper's sampler"))
     )
+    return ours, paper
 
 
-def _contrasted(shown: SampledView) -> UInt8[np.ndarray, "height width 4"]:
-    mean = shown.first[shown.mask].mean(0)
-    colours = np.clip(mean + CONTRAST * (shown.first - mean), 0, 1)
-    rgba = np.dstack([colours, shown.mask])
-    return np.rint(255 * rgba).astype(np.uint8)
+def _telling_window(paper: SampledView) -> Square:
+    """The square in which half a step changes the paper's image most."""
+    energy = ((paper.first - paper.second) ** 2).sum(-1)
+    total = cv2.boxFilter(
+        energy, -1, (CROP_PX, CROP_PX), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    v, u = np.unravel_index(total.argmax(), total.shape)
+    return square_with(centre=(float(u), float(v)), side=CROP_PX)
+
+
+def _raised(shown: SampledView) -> UInt8[np.ndarray, "height width 4"]:
+    detail = high_passed(shown.first, shown.mask)
+    colours = np.clip(shown.first + (DETAIL - 1) * detail, 0, 1)
+    return np.rint(255 * np.dstack([colours, shown.mask])).astype(np.uint8)
 
 
 def _checked_set(

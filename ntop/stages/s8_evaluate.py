@@ -40,6 +40,7 @@ from ntop.report.inputs import ActorFolders, Dataset, actor_folders
 from ntop.report.making import making_strip
 from ntop.report.mesh import painted_body
 from ntop.report.page import Comparison, Page, Strip, write_page
+from ntop.report.stripes import check_stripes, stripe_comparison, stripe_values
 from ntop.report.summary import (
     headline,
     lead,
@@ -96,6 +97,8 @@ def main(
     record = read_dataset_record(assembled)
     values = mean_values([report.values for report in reports.values()])
     values |= dataset_values(assembled)
+    checks = check_stripes(assembled, actors, model_of=lambda actor: body_model_of(config, actor))
+    values |= stripe_values(checks)
     exhibits = [item for report in reports.values() for item in report.exhibits]
     measured = stage_costs(benchmarks, actors=set(reports), dataset=assembled.name)
     costs = with_own(measured, started=started)
@@ -108,7 +111,12 @@ def main(
     )
     values |= cost_values(costs)
     page = compose(assembled, actors, reports=reports, values=complete(values))
-    page = replace(page, costs=cost_charts(costs), cost_table=table)
+    page = replace(
+        page,
+        costs=cost_charts(costs),
+        cost_table=table,
+        stripes=stripe_comparison(checks),
+    )
     with atomic_folder(out) as folder:
         by_actor = {name: report.values for name, report in reports.items()}
         write_metrics(values, by_actor=by_actor, path=folder / "metrics.json")
@@ -118,8 +126,7 @@ def main(
 
 def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) -> ActorReport:
     """Scores and pictures of one actor."""
-    file = config.body_models.get(actor.name)
-    model = load_body_model(Path(file) if file else None)
+    model = body_model_of(config, actor)
     recording = Recording(actor)
     held_out = set(config.held_out_views.get(actor.source, ()))
     render = avatar_renderer(actor, model)
@@ -141,6 +148,12 @@ def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) 
         exhibits += score_exhibits(actor, list(true.scores), against="truth")
     strip = making_strip(dataset, recording, model=model, render=render)
     return ActorReport(values, strip, heldout, truth, tuple(exhibits))
+
+
+def body_model_of(config: EvaluateConfig, actor: ActorFolders) -> BodyModel:
+    """The body model that the actor was fitted with."""
+    file = config.body_models.get(actor.name)
+    return load_body_model(Path(file) if file else None)
 
 
 def reference_masks(config: EvaluateConfig, source: str) -> ReferenceMasks:

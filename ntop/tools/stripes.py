@@ -80,8 +80,8 @@ def main(
     show(lines)
     bad = sum(not line.met for line in lines)
     sys.stdout.write(
-        f"{bad} of {len(lines) - 1} measurements exceed a limit (z < {MAX_Z:g}; with an avatar also "
-        f"phase rms <= {MAX_PHASE_SHIFT:g}, amplitude < {MAX_AMPLITUDE:g}, of 255)\n"
+        f"{bad} of {len(lines) - 1} measurements exceed a limit: z < {MAX_Z:g}; of the self-test "
+        f"also phase rms <= {MAX_PHASE_SHIFT:g} and amplitude < {MAX_AMPLITUDE:g}, of 255\n"
     )
     return EXIT_STRIPED if bad else 0
 

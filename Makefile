@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint numerics rulegraph
+.PHONY: env demo studio test lint numerics chaos rulegraph
 
 env: $(VENV)/.ready
 
@@ -41,6 +41,12 @@ lint: env
 numerics: env
 	$(RUN) python -m pytest tests/numerics -n $(CORES) --junitxml=$(VENV)/numerics.xml
 	$(RUN) python scripts/write_numerics_page.py $(VENV)/numerics.xml
+
+# disturb the tiny campaign many times; the table of trials is docs/chaos.md (an hour or two)
+TRIALS ?= 60
+SEED ?= 1
+chaos: env
+	$(RUN) python -m tests.chaos --trials $(TRIALS) --seed $(SEED) --jobs $(CORES)
 
 rulegraph: env
 	$(RUN) scripts/draw_rulegraph.sh

@@ -34,7 +34,15 @@ for word in "$@"; do
 done
 ntop status "${files[@]}" --every-s "${NTOP_PROGRESS_S:-60}" 9>&- &
 trap 'kill $! 2>/dev/null || true' EXIT
-snakemake --cores "$cores" --quiet progress "$@"
+if ! snakemake --cores "$cores" --quiet progress "$@"; then
+  # what Snakemake itself cannot write it names in a traceback, without a word about what to do
+  stuck=$(find results logs -type d ! -writable -print -quit 2>/dev/null || true)
+  if [[ -n $stuck ]]; then
+    echo "ntop: cannot write $stuck: Read-only file system, or another user's folder; check the" \
+      "mount and the permissions, then run the same command again" >&2
+  fi
+  exit 1
+fi
 echo
 echo "dataset: $PWD/results/7_assemble/$dataset"
 echo "report:  $PWD/results/8_evaluate/$dataset/report.html"

@@ -6,6 +6,7 @@ Random numbers depend on the seed and the step's number, so the step stands for 
 import dataclasses
 import hashlib
 import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,8 +80,21 @@ def settings_digest(settings: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def content_digest(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> str:
+    """SHA-256 of all that is saved: the format itself does not notice a changed byte."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(arrays[name].data)
+    return digest.hexdigest()
+
+
 def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
-    """Write the state atomically: a new file beside the old one, then one rename."""
+    """Write the state atomically: a new file beside the old one, then one rename.
+
+    Raises:
+        DataError: the folder cannot be written, or the disk is full.
+    """
     arrays = {name: getattr(state, name) for name in ARRAYS}
     arrays |= {f"grid_{name}": getattr(state.grid, name) for name in GRID_ARRAYS}
     arrays |= {"occupancy": state.occupancy.cells, "occupancy_origin": state.occupancy.origin}
@@ -94,10 +108,21 @@ def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
         "step": state.step,
         "curve": [dataclasses.astuple(line) for line in state.curve],
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"state": json.dumps(header), "sha256": content_digest(arrays, header)}
     temporary = path.with_name(path.name + ".tmp")
-    safetensors.numpy.save_file(arrays, temporary, metadata={"state": json.dumps(header)})
-    temporary.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as stream:
+            stream.write(safetensors.numpy.save(arrays, metadata=metadata))
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise DataError(
+            f"cannot write checkpoint {path}: {error.strerror or error}; check the folder's "
+            "permissions and the free space, then run the same command again"
+        ) from error
 
 
 def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | None:
@@ -114,8 +139,12 @@ def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | No
         with safetensors.safe_open(path, framework="numpy") as stream:
             header = json.loads(stream.metadata()["state"])
             arrays = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+            if content_digest(arrays, header) != stream.metadata()["sha256"]:
+                raise ValueError("its content is not what was saved")
     except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise DataError(f"checkpoint {path} is damaged ({error}); delete it") from error
+        raise DataError(
+            f"checkpoint {path} is damaged ({error}); delete it, then run the same command again"
+        ) from error
     if header["settings"] != settings_digest(settings):
         return None
     grid = CanonicalGrid(

@@ -78,7 +78,9 @@ def publish_folder(work: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         old = None
         if target.exists():
-            old = target.with_name(f".{target.name}.{uuid.uuid4().hex}.old")
+            old = target.with_name(f".{target.name}.old")
+            if old.exists():  # left by a run that was killed between the two renames
+                shutil.rmtree(old)
             target.rename(old)
         work.rename(target)
         if old is not None:

@@ -4,12 +4,14 @@ import contextlib
 import os
 import random
 import signal
+import subprocess
 import time
 
 import psutil
 
-from tests.chaos.trial import Hit
-from tests.chaos.workspace import OUTPUTS, WORK, TooLateError, Workspace
+from ntop.storage.work import EXIT_TERMINATED
+from tests.chaos.trial import DefeatError, Hit
+from tests.chaos.workspace import WORK, TooLateError, Workspace
 
 # seconds of an undisturbed job on an idle core: the range of random moments
 LASTS_S = {
@@ -125,18 +127,22 @@ def terminate_cleanly(stage: str):
     def strike(space: Workspace, chance: random.Random) -> Hit:
         space.undo(stage)
         space.start()
+        words = space.worker(stage).cmdline()
         content = space.folder / WORK[stage] / "content"
         space.wait_for(lambda: pieces(content), "a finished piece")
-        time.sleep(chance.uniform(0, 0.3))
-        with gone_is_too_late():
-            space.worker(stage).send_signal(signal.SIGTERM)
-        wait_for_end(space)
-        if (space.folder / OUTPUTS[stage]).exists():
-            raise TooLateError("it had just finished")
-        said = space.said()
-        assert "exit status 143" in said or "exit code 143" in said or "143" in said, said
-        assert pieces(content), "a clean stop keeps what was finished"
-        return Hit(f"SIGTERM after {len(pieces(content))} pieces: exit code 143, they stayed")
+        space.kill_everything()
+        # the same job by hand: only its parent learns an exit code
+        alone = subprocess.Popen(words, cwd=space.folder, env=space.environment,
+                                 stderr=subprocess.PIPE, text=True)  # fmt: skip
+        before = len(pieces(content))
+        time.sleep(chance.uniform(1, 4))
+        alone.send_signal(signal.SIGTERM)
+        said = alone.communicate(timeout=900)[1]
+        if alone.returncode in {0, -signal.SIGTERM}:
+            raise TooLateError("it had just finished, or not yet begun")
+        if alone.returncode != EXIT_TERMINATED or len(pieces(content)) < before:
+            raise DefeatError(f"exit code {alone.returncode}, {pieces(content)} left: {said}")
+        return Hit(f"SIGTERM, {before} pieces there: exit code 143, {len(pieces(content))} left")
 
     return strike
 

@@ -28,6 +28,22 @@ OUTPUTS = {
     "assemble": DATASET,
     "evaluate": "results/8_evaluate/test",
 }
+_FITTED_SHARD = "raw/loose/range/h1.2_r1.0/000000"
+_FITTED_RESULTS = [
+    f"results/4_train/{FITTED}",
+    f"results/5_render/{_FITTED_SHARD}",
+    f"results/6_annotate/{_FITTED_SHARD}.parquet",
+]
+FOLLOWING = {
+    "capture": [OUTPUTS["train"], OUTPUTS["render"], OUTPUTS["annotate"]],
+    "mask": [f"results/3_fit/{FITTED}", *_FITTED_RESULTS],
+    "fit": _FITTED_RESULTS,
+    "train": [OUTPUTS["render"], OUTPUTS["annotate"]],
+    "render": [OUTPUTS["annotate"]],
+    "annotate": [],
+    "assemble": [],
+    "evaluate": [],
+}
 WORK = {"train": f"results/work/4_train/{ACTOR}", "render": f"results/work/5_render/{SHARD}"}
 PATIENCE_S = 900.0
 T = TypeVar("T")
@@ -50,15 +66,15 @@ class Workspace(Project):
         self._mounts: list[Path] = []
 
     def undo(self, stage: str) -> None:
-        """Remove a stage's output and what keeps Snakemake from asking for it."""
-        for name in dict.fromkeys([stage, "annotate", "assemble"]):
-            path = self.folder / OUTPUTS[name]
-            if name == "annotate" and stage not in {"render", "annotate"}:
+        """Remove a stage's output and, as Snakemake asks for it no sooner, what follows from it."""
+        for name in [OUTPUTS[stage], *FOLLOWING[stage], DATASET]:
+            path = self.folder / name
+            if not path.exists():
                 continue
             if path.is_dir():
                 shutil.rmtree(path)
             else:
-                path.unlink(missing_ok=True)
+                path.unlink()
         if stage == "evaluate":
             self.target = OUTPUTS["evaluate"]
 

@@ -121,6 +121,25 @@ def test_a_damaged_checkpoint_is_named(views, model, tmp_path):
         trained(views, model, checkpoint_path=path)
 
 
+def test_a_changed_byte_of_a_checkpoint_is_noticed(views, model, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(TrainingStoppedError):
+        trained(views, model, checkpoint_path=path, stop_requested=lambda: True)
+    content = bytearray(path.read_bytes())
+    for place in (len(content) // 2, len(content) - 1):
+        content[place] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=r"damaged.*not what was saved.*delete it"):
+            trained(views, model, checkpoint_path=path)
+        content[place] ^= 1
+
+
+def test_a_checkpoint_that_cannot_be_written_says_so(views, model, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"cannot write checkpoint .*Not a directory.*free space"):
+        trained(views, model, checkpoint_path=tmp_path / "file/checkpoint.safetensors")
+
+
 def test_an_avatar_survives_the_disk_and_damage_is_noticed(views, model, tmp_path):
     avatar, _ = trained(views, model)
     save_avatar(avatar, tmp_path, write=lambda path, content: path.write_bytes(content))

@@ -18,7 +18,14 @@ from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.card import dataset_card
 from ntop.storage.coco import COCO17, SMPL24, CocoWriter, coco_writer
-from ntop.storage.files import file_row, files_writer, find_damage, raise_damage, read_records
+from ntop.storage.files import (
+    check_files,
+    file_row,
+    files_writer,
+    find_damage,
+    raise_damage,
+    read_records,
+)
 from ntop.storage.links import link_or_copy
 from ntop.storage.manifest import ManifestWriter, manifest_writer
 from ntop.storage.pace import paced
@@ -118,6 +125,7 @@ def in_order(shards: list[Shard]) -> list[Shard]:
     """
     keyed = []
     for shard in shards:
+        check_files(shard.renders, only={"renders.parquet", "skipped.json"})
         rows = read_table(shard.renders / "renders.parquet", schema=schemas.RENDER)
         if rows:
             first = rows[0]

@@ -63,7 +63,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         yield work
     except OSError as error:
         raise DataError(
-            f"cannot write {error.filename or work}: {error.strerror or error}; "
+            f"cannot make {target}: {error.filename or work}: {error.strerror or error}; "
             "check the folder's permissions and the free space, then run the same command again"
         ) from error
     publish_folder(work, target)

@@ -33,10 +33,12 @@ def work_folder(work: Path, *, recipe: dict[str, Any]) -> Iterator[Path]:
     """
     try:
         work.mkdir(parents=True, exist_ok=True)
+        (work / CONTENT_NAME).mkdir(exist_ok=True)
         lock = (work / LOCK_NAME).open("w")
     except OSError as error:
         raise DataError(
-            f"cannot use work folder {work}: {error.strerror or error}; check its permissions"
+            f"cannot use work folder {work}: {error.strerror or error}; "
+            "check its permissions and the free space, then run the same command again"
         ) from error
     with lock:
         try:

@@ -13,6 +13,7 @@ from tests.chaos.damage import (
     missing_file,
     moved_in_time,
     truncate,
+    truncated_metadata,
 )
 from tests.chaos.signals import (
     kill_group,
@@ -90,6 +91,7 @@ QUICK = [
     Kind("a second worker on one shard", "render", duplicate_worker("render")),
     Kind("another recipe's work folder", "render", stale_plan_of_work),
     Kind("lose Snakemake's records", "any", lost_metadata),
+    Kind("empty Snakemake's records", "any", truncated_metadata),
 ]  # fmt: skip
 
 # each repeats a training and what follows
@@ -135,7 +137,6 @@ IN_TESTS = [
     ("fill the disk", "render"),
     ("read-only output", "assemble"),
     ("change the clock", "assemble"),
-    ("two heads on one folder", "render"),
     ("a second worker on one shard", "render"),
 ]
 

@@ -4,11 +4,14 @@ import os
 import random
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from tests.chaos.signals import pieces
-from tests.chaos.trial import Hit
+from tests.chaos.trial import Hit, Strike
 from tests.chaos.workspace import ACTOR, DATASET, OUTPUTS, WORK, TooLateError, Workspace
+
+Harm = Callable[[Path, random.Random], str]
 
 
 def some_file(space: Workspace, chance: random.Random, place: str, pattern: str) -> Path:
@@ -37,7 +40,7 @@ def mangle(path: Path, chance: random.Random) -> str:
     return f"bytes {first} to {first + len(old) - 1} of {size} overwritten"
 
 
-def damaged_result(how, place: str, pattern: str, *, rerun: str = ""):
+def damaged_result(how: Harm, place: str, pattern: str, *, rerun: str = "") -> Strike:
     """Damage a finished result; `rerun` is a stage that has yet to read it, or none."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -50,7 +53,7 @@ def damaged_result(how, place: str, pattern: str, *, rerun: str = ""):
     return strike
 
 
-def damaged_work(stage: str, pattern: str, how=truncate):
+def damaged_work(stage: str, pattern: str, how: Harm = truncate) -> Strike:
     """Damage what a killed job has left in its work folder."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -70,7 +73,7 @@ def damaged_work(stage: str, pattern: str, how=truncate):
     return strike
 
 
-def moved_in_time(days: float):
+def moved_in_time(days: float) -> Strike:
     """Give all results times that are off, as a restored backup or a wrong clock does."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -92,7 +95,17 @@ def lost_metadata(space: Workspace, chance: random.Random) -> Hit:
     return Hit(".snakemake removed")
 
 
-def missing_file(place: str, pattern: str, *, rerun: str):
+def truncated_metadata(space: Workspace, chance: random.Random) -> Hit:
+    """Empty some of Snakemake's own records, as a power cut does."""
+    space.undo(chance.choice(["render", "annotate", "assemble"]))
+    records = sorted(p for p in (space.folder / ".snakemake/metadata").rglob("*") if p.is_file())
+    chosen = chance.sample(records, len(records) // 2)
+    for path in chosen:
+        os.truncate(path, 0)
+    return Hit(f"{len(chosen)} of {len(records)} records of Snakemake emptied")
+
+
+def missing_file(place: str, pattern: str, *, rerun: str) -> Strike:
     """Remove a file from a finished folder."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:

@@ -10,7 +10,7 @@ import time
 import psutil
 
 from ntop.storage.work import EXIT_TERMINATED
-from tests.chaos.trial import DefeatError, Hit
+from tests.chaos.trial import DefeatError, Hit, Strike
 from tests.chaos.workspace import WORK, TooLateError, Workspace
 
 # seconds of an undisturbed job on an idle core: the range of random moments
@@ -45,7 +45,7 @@ def moment(space: Workspace, chance: random.Random, stage: str) -> str:
     return words
 
 
-def kill_worker(number: signal.Signals, stage: str):
+def kill_worker(number: signal.Signals, stage: str) -> Strike:
     """A signal to the stage's own process, as the kernel or a colleague sends it."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -61,7 +61,7 @@ def kill_worker(number: signal.Signals, stage: str):
     return strike
 
 
-def kill_group(stage: str):
+def kill_group(stage: str) -> Strike:
     """kill -9 of the head's and the worker's process groups at once."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -76,7 +76,7 @@ def kill_group(stage: str):
     return strike
 
 
-def pull_the_plug(stage: str):
+def pull_the_plug(stage: str) -> Strike:
     """kill -9 of everything, as a power cut."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -89,7 +89,7 @@ def pull_the_plug(stage: str):
     return strike
 
 
-def kill_head(number: signal.Signals, stage: str):
+def kill_head(number: signal.Signals, stage: str) -> Strike:
     """A signal to Snakemake alone; after SIGKILL its jobs live on as orphans."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -107,7 +107,7 @@ def kill_head(number: signal.Signals, stage: str):
     return strike
 
 
-def press_ctrl_c(stage: str):
+def press_ctrl_c(stage: str) -> Strike:
     """SIGINT to the terminal's foreground group."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -121,7 +121,7 @@ def press_ctrl_c(stage: str):
     return strike
 
 
-def terminate_cleanly(stage: str):
+def terminate_cleanly(stage: str) -> Strike:
     """SIGTERM to a stage that can stop at a border: exit code 143, and finished pieces stay."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:

@@ -113,7 +113,8 @@ def orphans(space: SlurmWorkspace) -> str:
     return done.stdout if done.returncode == 3 else ""
 
 
-SLURM_KINDS: list[tuple[str, Callable[[SlurmWorkspace, random.Random], Hit]]] = [
+SlurmStrike = Callable[[SlurmWorkspace, random.Random], Hit]
+SLURM_KINDS: list[tuple[str, SlurmStrike]] = [
     ("SLURM: requeue", requeue),
     ("SLURM: preempt", preempt),
     ("SLURM: time out", timed_out),
@@ -137,7 +138,9 @@ def slurm_trials(
             number, own = first + index, seed + 1000 + index
             space = SlurmWorkspace(finished, place / f"trial{number:03d}", cluster)
             try:
-                outcomes.append(slurm_trial(number, own, name, strike, space, finished))
+                outcomes.append(
+                    slurm_trial(number, own, name, strike, space=space, finished=finished)
+                )
             finally:
                 space.end()
                 space.remove()
@@ -147,7 +150,15 @@ def slurm_trials(
     return outcomes
 
 
-def slurm_trial(number, seed, name, strike, space, finished) -> Outcome:
+def slurm_trial(
+    number: int,
+    seed: int,
+    name: str,
+    strike: SlurmStrike,
+    *,
+    space: SlurmWorkspace,
+    finished: Project,
+) -> Outcome:
     """Disturb, submit again, compare."""
     survived, hit, started = True, Hit("not hit"), time.monotonic()
     try:
@@ -160,4 +171,13 @@ def slurm_trial(number, seed, name, strike, space, finished) -> Outcome:
     except (AssertionError, DefeatError) as error:
         survived, outcome = False, f"LOST: {error}"
     seconds = round(time.monotonic() - started, 1)
-    return Outcome(number, seed, name, "render", hit.what, outcome, survived, seconds)
+    return Outcome(
+        number=number,
+        seed=seed,
+        disturbance=name,
+        stage="render",
+        hit=hit.what,
+        outcome=outcome,
+        survived=survived,
+        rerun_s=seconds,
+    )

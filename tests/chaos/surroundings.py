@@ -7,13 +7,13 @@ import subprocess
 from pathlib import Path
 
 from tests.chaos.signals import wait_for_end
-from tests.chaos.trial import Hit
+from tests.chaos.trial import Hit, Strike
 from tests.chaos.workspace import OUTPUTS, SHARD, WORK, TooLateError, Workspace
 
 FAKETIME = next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
 
 
-def full_disk(stage: str, place: str, sizes_kb: tuple[int, int]):
+def full_disk(stage: str, place: str, sizes_kb: tuple[int, int]) -> Strike:
     """A small disk at `place` that runs full while the stage writes."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -24,16 +24,15 @@ def full_disk(stage: str, place: str, sizes_kb: tuple[int, int]):
         if space.finish() == 0:
             raise TooLateError("it has fitted")
         said = space.said()
-        assert "No space left on device" in said, said
         space.remount("size=2g")
-        [named] = set(re.findall(r"cannot \w+ (\S+?):? .*No space left", said)[:1]) or {""}
-        assert place in named, said
-        return Hit(f"{place} was full at {size_kb} KiB, the error named {Path(named).name}")
+        named = re.search(rf"cannot .*?({place}[^:\s]*).*No space left on device.*free space", said)
+        assert named, said
+        return Hit(f"{place} was full at {size_kb} KiB, the error named {Path(named[1]).name}")
 
     return strike
 
 
-def read_only(stage: str, place: str):
+def read_only(stage: str, place: str) -> Strike:
     """`place` cannot be written."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -52,7 +51,7 @@ def read_only(stage: str, place: str):
     return strike
 
 
-def wrong_clock(stage: str):
+def wrong_clock(stage: str) -> Strike:
     """A run under another date is killed, the next one has the right date."""
 
     def strike(space: Workspace, chance: random.Random) -> Hit:
@@ -100,7 +99,7 @@ def two_heads(space: Workspace, chance: random.Random) -> Hit:
     return Hit(f"a second {kind} was refused, the first one finished")
 
 
-def duplicate_worker(stage: str):
+def duplicate_worker(stage: str) -> Strike:
     """The same job started by hand beside the running one: the lock of its work folder holds."""
 
     def strike(space: Workspace, _chance: random.Random) -> Hit:

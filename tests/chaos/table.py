@@ -23,7 +23,7 @@ late is repeated. `make chaos TRIALS=60 SEED=1` makes this page; a dozen of the 
 
 def write_table(outcomes: list[Outcome], out: Path) -> None:
     """Write `out`.json and `out`.md."""
-    rows = [asdict(outcome) for outcome in outcomes]
+    rows = [asdict(outcome) | {"number": n} for n, outcome in enumerate(outcomes, start=1)]
     out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n")
     survived = sum(outcome.survived for outcome in outcomes)
     kinds = Counter(outcome.disturbance for outcome in outcomes)

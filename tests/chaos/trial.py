@@ -62,6 +62,7 @@ def run_trial(number: int, kind: Kind, seed: int, *, finished: Project, place: P
     """Disturb a copy of the finished campaign below `place`; its dataset must come out the same."""
     chance = random.Random(seed)
     for attempt in range(ATTEMPTS):
+        started, hit = time.monotonic(), Hit("it failed before it was disturbed")
         space = Workspace(finished, place / f"trial{number:03d}_{attempt}")
         try:
             hit = kind.strike(space, chance)
@@ -71,16 +72,25 @@ def run_trial(number: int, kind: Kind, seed: int, *, finished: Project, place: P
                 outcome, survived = f"DIFFERENT: {difference(space, finished)}", False
         except TooLateError:
             continue
-        except DefeatError as defeat:
+        except (DefeatError, AssertionError, subprocess.TimeoutExpired) as defeat:
             outcome, survived = f"LOST: {defeat}", False
         finally:
             space.remove()
         seconds = time.monotonic() - started
-        return Outcome(
-            number, seed, kind.name, kind.stage, hit.what, outcome, survived, round(seconds, 1)
-        )
-    text = f"the moment was missed {ATTEMPTS} times"
-    return Outcome(number, seed, kind.name, kind.stage, text, "LOST: not tried", False, 0.0)
+        break
+    else:
+        hit, seconds = Hit(f"the moment was missed {ATTEMPTS} times"), 0.0
+        outcome, survived = "LOST: not tried", False
+    return Outcome(
+        number=number,
+        seed=seed,
+        disturbance=kind.name,
+        stage=kind.stage,
+        hit=hit.what,
+        outcome=outcome,
+        survived=survived,
+        rerun_s=round(seconds, 1),
+    )
 
 
 def recover(space: Workspace, hit: Hit) -> str:
@@ -129,10 +139,10 @@ def remedy_in(said: str, space: Workspace, steps: list[str]) -> list[str]:
     if damaged := re.search(r"checkpoint (\S+) is damaged .*delete it", said):
         (space.folder / damaged[1]).unlink()
         steps.append("deleted as it says")
-    elif re.search(r"cannot \w+ \S+.*: No space left on device.*free space", said):
+    elif re.search(r"cannot .*No space left on device.*free space", said):
         space.remount("size=2g")
         steps.append("space made")
-    elif re.search(r"cannot \w+ \S+.*: Read-only file system.*permissions", said):
+    elif re.search(r"cannot .*Read-only file system.*permissions", said):
         space.remount("rw")
         steps.append("made writable")
     elif orphans := re.search(r"^  kill ([0-9 ]+)$", said, re.MULTILINE):

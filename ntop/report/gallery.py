@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import UInt8
 import torch
+from jaxtyping import UInt8
 
 from ntop.body.skeletons import COCO17_NAMES, COCO17_SKELETON, SMPL24_EDGES, SMPL24_NAMES
 from ntop.conventions import MASK_ALPHA

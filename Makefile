@@ -39,7 +39,7 @@ lint: env
 
 # the acceptance suite for arithmetic, with its measured margins written into docs/numerics.md
 numerics: env
-	$(RUN) python -m pytest tests/numerics -n $(CORES) --junitxml=$(VENV)/numerics.xml
+	$(RUN) python -m pytest tests/numerics -n $(CORES) -o junit_family=xunit1 --junitxml=$(VENV)/numerics.xml
 	$(RUN) python scripts/write_numerics_page.py $(VENV)/numerics.xml
 
 # disturb the tiny campaign many times; the table of trials is docs/chaos.md (an hour or two)

@@ -134,8 +134,7 @@ class Pinhole:
         if any(self.distortion):
             solution, inside = self._undistorted(target.detach().double())
             # the implicit function theorem: dx = J^-1 dt at the solution, whatever found it
-            inverse = torch.linalg.inv(self._distortion_jacobian(solution)).to(pixels.dtype)
-            moved = (inverse @ (target - target.detach())[..., None])[..., 0]
+            moved = self._step(solution.to(pixels.dtype), target - target.detach())
             xy = solution.to(pixels.dtype) + moved
         else:
             exact = target.detach().double()
@@ -158,8 +157,7 @@ class Pinhole:
             miss = target - self._distort(xy)
             if not bool((miss.abs() > 1e-16).any()):
                 break
-            step = torch.linalg.solve(self._distortion_jacobian(xy), miss[..., None])[..., 0]
-            xy = xy + step
+            xy = xy + self._step(xy, miss)
             # back into the disc on which the derivative can be inverted
             xy = xy * (limit / xy.norm(dim=-1, keepdim=True).clamp(min=limit))
         residual_px = ((self._distort(xy) - target) * focal).norm(dim=-1)
@@ -179,6 +177,17 @@ class Pinhole:
             ],
             -1,
         )
+
+    def _step(
+        self, xy: Float[Tensor, "*batch 2"], miss: Float[Tensor, "*batch 2"]
+    ) -> Float[Tensor, "*batch 2"]:
+        """By how much (x, y) moves where D(x, y) moves by `miss`: J^-1 of a symmetric 2 x 2 J."""
+        jacobian = self._distortion_jacobian(xy)
+        along, across, down = jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 1]
+        determinant = along * down - across * across
+        x = (down * miss[..., 0] - across * miss[..., 1]) / determinant
+        y = (along * miss[..., 1] - across * miss[..., 0]) / determinant
+        return torch.stack([x, y], -1)
 
     def _distortion_jacobian(self, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2 2"]:
         k1, k2, p1, p2, k3 = self.distortion

@@ -25,26 +25,17 @@ TINY = 1e-30
 
 
 @dataclass(frozen=True)
-class PaperRays:
-    """What the paper's sampler sees; `near_m` and `step_m` give every ray's phase.
+class PaperSampling:
+    """What the paper's sampler sees, per ray or per pixel.
 
-    `rgb` is premultiplied. Rays that miss the box have step 0 and see nothing.
+    `near_m` (first sample) and `step_m` give every ray's phase; rays that miss the box have step 0
+    and see nothing. `rgb` is premultiplied per ray, and straight in an image.
     """
 
-    rgb: Float[np.ndarray, "ray 3"]
-    alpha: Float[np.ndarray, " ray"]
-    near_m: Float[np.ndarray, " ray"]
-    step_m: Float[np.ndarray, " ray"]
-
-
-@dataclass(frozen=True)
-class PaperView:
-    """A view as the paper's sampler renders it; fields as in `PaperRays`, `rgb` straight."""
-
-    rgb: Float[np.ndarray, "height width 3"]
-    alpha: Float[np.ndarray, "height width"]
-    near_m: Float[np.ndarray, "height width"]
-    step_m: Float[np.ndarray, "height width"]
+    rgb: Float[np.ndarray, "*shape 3"]
+    alpha: Float[np.ndarray, "*shape"]
+    near_m: Float[np.ndarray, "*shape"]
+    step_m: Float[np.ndarray, "*shape"]
 
 
 def box_interval(
@@ -83,7 +74,7 @@ def trace_paper_rays(
     joints_world: Float[np.ndarray, "joint 3"],
     samples: int = SAMPLES,
     shift: float | Float[np.ndarray, " ray"] = 0.0,
-) -> PaperRays:
+) -> PaperSampling:
     """Rays from one point with the paper's sampling.
 
     Args:
@@ -103,7 +94,7 @@ def trace_paper_rays(
         posed.grid.tables(), posed.warp.tables, posed.light, origin - posed.warp.origin_world,
         directions, near, step, shifts, samples, rgb, alpha,
     )  # fmt: skip
-    return PaperRays(rgb, alpha, near, step)
+    return PaperSampling(rgb, alpha, near, step)
 
 
 def render_paper_view(
@@ -113,7 +104,7 @@ def render_paper_view(
     joints_world: Float[np.ndarray, "joint 3"],
     pixels: Bool[np.ndarray, "height width"] | None = None,
     shift: float = 0.0,
-) -> PaperView:
+) -> PaperSampling:
     """One view through any lens, one ray through the centre of every pixel that may see the body.
 
     `pixels`: only these, for measurements that need no others. Other arguments: see
@@ -126,7 +117,7 @@ def render_paper_view(
     rays = trace_paper_rays(
         posed, camera.center_world, directions[valid], joints_world=joints_world, shift=shift
     )
-    view = PaperView(
+    view = PaperSampling(
         rgb=np.zeros((*mask.shape, 3)),
         alpha=np.zeros(mask.shape),
         near_m=np.zeros(mask.shape),

@@ -92,7 +92,7 @@ def test_the_browser_shows_everything_without_help(report, tmp_path, width):
     flags = ("--dump-dom", f"--window-size={width},900")
     answer = browse(page, profile=tmp_path / "profile", flags=flags)
     seen = probed(answer)
-    assert seen["images"] == 2 * 6 + 2 * (9 + 4) + 3 * 4
+    assert seen["images"] == 2 * 6 + 2 * (9 + 4) + 3 * 4 + 4
     assert seen["errors"] == [] and seen["fetched"] == []
     assert seen["empty"] == seen["unnamed"] == 0
     assert seen["overflow"] <= 0

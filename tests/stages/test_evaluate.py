@@ -58,6 +58,10 @@ def test_metrics_hold_every_key_and_the_known_values(results):
     # nobody checked masks of this actor by hand: nothing is invented
     assert set(metrics["heldout"].values()) == {None}
     assert metrics["checks"]["rle_equals_mask"] == 1
+    stripes = metrics["stripes"]
+    assert len(stripes) == 2 * 2 * 3  # of one rig: lenses, samplers, figures
+    assert stripes["h1.2_r1.0.fisheye.ours.phase_rms"] <= 0.37
+    assert stripes["h1.2_r1.0.pinhole.paper.z"] >= 0
     assert metrics["checks"]["coco_self_ap"] == pytest.approx(1)
     assert metrics["seconds"]["train"] == 22
     assert metrics["seconds"]["render"] is None
@@ -72,9 +76,10 @@ def test_the_report_is_one_file_with_its_sections(results):
     page = (results / "report.html").read_text()
     anchors = re.findall(r'<section id="(\w+)"', page)
     assert anchors == [
-        "making", "views", "truth", "training", "statistics", "figures", "costs", "provenance",
+        "making", "views", "truth", "stripes", "training", "statistics", "figures", "costs",
+        "provenance",
     ]  # fmt: skip
-    assert len(re.findall(r"<img ", page)) == 2 * 6 + 2 * (9 + 4) + 3 * 4
+    assert len(re.findall(r"<img ", page)) == 2 * 6 + 2 * (9 + 4) + 3 * 4 + 4
     assert "http:" not in page and "https:" not in page
 
 

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from ntop.config.base import Section
 from ntop.config.sources import Given, ReferenceMasks, Source
-from ntop.config.tables import Actor, Sequence
+from ntop.config.tables import Actor, Gender, Sequence
 from ntop.geometry.monotone import monotone_limit
 
 
@@ -178,6 +178,11 @@ class RenderConfig(BodySection):
     rigs: dict[str, RigConfig]
     image: ImageConfig = ImageConfig()
     sets_per_shard: int = Field(default=10, ge=1)
+    storage: Literal["files", "tar"] = Field(
+        default="files",
+        description="`tar`: the pictures of a shard are one file, for campaigns whose millions of "
+        "files a file system would refuse.",
+    )
     seed: int = 0
     paper_compat: bool = False
 
@@ -195,17 +200,32 @@ class AssembleConfig(Section):
     sets_per_shard: int = Field(ge=1)
 
 
-class EvaluateConfig(Section):
-    """Section `evaluate`, completed by the workflow with what the sources hold out."""
+class EvaluateKeys(Section):
+    """What the YAML may say about `evaluate`; the workflow adds the rest."""
 
+    max_sets: int = Field(
+        default=500,
+        ge=1,
+        description="Sets that the report checks and shows; of a larger dataset about as many, "
+        "spread evenly over actors and rigs.",
+    )
+
+
+class EvaluateConfig(EvaluateKeys):
+    """Section `evaluate`, completed by the workflow with what it knows of the sources."""
+
+    provides: dict[str, tuple[Given, ...]] = Field(
+        default_factory=dict, description="Source -> what it brings along."
+    )
     held_out_views: dict[str, tuple[str, ...]] = Field(
         default_factory=dict, description="Source -> cameras that training never saw."
     )
     reference_masks: dict[str, tuple[ReferenceMasks, ...]] = Field(
         default_factory=dict, description="Source -> hand-checked masks of those cameras."
     )
-    body_models: dict[str, str] = Field(
-        default_factory=dict, description="`source/actor` -> SMPL file; others: the embedded body."
+    body_models: dict[str, dict[Gender, str]] = Field(
+        default_factory=dict,
+        description="Source -> gender -> SMPL file; others: the embedded body.",
     )
 
 

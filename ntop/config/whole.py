@@ -13,6 +13,7 @@ from ntop.config.base import Section, explain
 from ntop.config.sections import (
     STAGE_SECTIONS,
     AnnotateConfig,
+    EvaluateKeys,
     FitConfig,
     MaskConfig,
     RenderConfig,
@@ -29,10 +30,6 @@ class CaptureKeys(Section):
 
 class AssembleKeys(Section):
     """What the YAML may say about `assemble`; the workflow adds the rest."""
-
-
-class EvaluateKeys(Section):
-    """What the YAML may say about `evaluate`; the workflow adds the rest."""
 
 
 class Config(Section):

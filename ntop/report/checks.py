@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +14,10 @@ from pycocotools.cocoeval import COCOeval
 from ntop.body.skeletons import COCO17_SIGMAS, SMPL24_SIGMAS
 from ntop.conventions import MASK_ALPHA, DataError
 from ntop.report.inputs import Dataset
+from ntop.storage.coco import read_coco
 from ntop.storage.images import read_rgba
 from ntop.storage.renders import fisheye_camera
+from ntop.storage.sets import read_set
 
 ANNOTATION_SIGMAS = {"person_keypoints": COCO17_SIGMAS, "person_smpl24": SMPL24_SIGMAS}
 
@@ -35,6 +36,9 @@ def reprojection_max_px(dataset: Dataset) -> float:
     From the manifest: the joints in the world and in the camera's frame. From the set files: joints
     and COCO points through the cameras that the JSON holds. All in float64; points outside the
     image circle count as well, because unclipped coordinates are kept.
+
+    Raises:
+        DataError: a set file is missing or damaged.
     """
     worst = 0.0
     for row in dataset.rows:
@@ -44,8 +48,8 @@ def reprojection_max_px(dataset: Dataset) -> float:
             from_world, _ = camera.project(_points(person["joints3d_world_m"], 3))
             from_camera, _ = camera.lens.project(_points(person["joints3d_camera_m"], 3))
             worst = max(worst, _farthest(from_world, stored), _farthest(from_camera, stored))
-    for path in sorted((dataset.folder / "sets").rglob("*.json")):
-        record = json.loads(path.read_text())
+    for views in dataset.sets.values():
+        record = read_set(next(iter(views.values())), folder=dataset.folder)
         bodies = {body["person_id"]: body for body in record["bodies"]}
         for view in record["views"].values():
             camera = fisheye_camera(view["camera"])
@@ -75,16 +79,23 @@ def annotation_files(dataset: Dataset) -> list[Path]:
     return files
 
 
+def file_names(dataset: Dataset) -> set[str]:
+    """What the COCO files call the images that are looked at."""
+    return {row["image_path"] for row in dataset.rows}
+
+
 def coco_self_ap(dataset: Dataset) -> float | None:
     """Lowest average precision of an annotation file against itself (pycocotools).
 
     None if no file has an annotation.
     """
-    scores = []
+    scores, names = [], file_names(dataset)
     for path in annotation_files(dataset):
         sigmas = ANNOTATION_SIGMAS[path.stem.rsplit("_", 1)[0]]
         with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-            truth = COCO(str(path))
+            truth = COCO()
+            truth.dataset = read_coco(path, file_names=names)
+            truth.createIndex()
             if not truth.anns:
                 continue
             answers = [
@@ -104,7 +115,7 @@ def check_masks(dataset: Dataset) -> MaskChecks:
     """Compare every image's mask with its run-length codes and its visible keypoints."""
     codes: dict[str, list[dict]] = {}
     for path in annotation_files(dataset):
-        document = json.loads(path.read_text())
+        document = read_coco(path, file_names=file_names(dataset))
         names = {image["id"]: image["file_name"] for image in document["images"]}
         for annotation in document["annotations"]:
             name = names[annotation["image_id"]]

@@ -140,6 +140,11 @@ CHECKS = (
         "The same in the box of the fisheye views with known truth.", at_least=7,
     ),
     Meaning(
+        "checks.images", "images checked", "",
+        "What the checks of labels and masks looked at: all, or sets spread evenly over actors "
+        "and rigs (evaluate.max_sets). `ntop check` reads every file.",
+    ),
+    Meaning(
         "checks.coco_self_ap", "COCO files", "",
         "Lowest average precision of an annotation file evaluated against itself.", at_least=1,
     ),

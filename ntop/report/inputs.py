@@ -1,14 +1,21 @@
 """What the evaluation reads: the dataset's rows, each actor's folders."""
 
+import math
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from ntop.config.sources import Given
+from ntop.config.tables import Actor, Gender
 from ntop.conventions import DataError
-from ntop.storage import schemas
 from ntop.storage.keys import SetKey
+from ntop.storage.manifest import ManifestReader
 from ntop.storage.renders import set_key
-from ntop.storage.tables import Row, read_table
+from ntop.storage.tables import Row
+
+MAX_SETS = 500  # to look at; a picture takes about 10 ms
 
 
 @dataclass(frozen=True)
@@ -21,6 +28,7 @@ class ActorFolders:
     mattes: Path
     bodies: Path
     avatar: Path
+    gender: Gender = "n"
 
     @property
     def name(self) -> str:
@@ -30,31 +38,39 @@ class ActorFolders:
 
 @dataclass(frozen=True)
 class Dataset:
-    """An assembled dataset: its folder and the manifest's rows, in the manifest's order."""
+    """An assembled dataset: its folder and rows of its manifest, in the manifest's order.
+
+    `rows` are all rows of a small dataset; of a large one, those of evenly spread sets.
+    """
 
     folder: Path
     rows: tuple[Row, ...]
+    num_images: int
+    num_sets: int
 
     @classmethod
-    def read(cls, folder: Path) -> "Dataset":
-        """Read the manifest.
+    def read(cls, folder: Path, *, max_sets: int = MAX_SETS) -> "Dataset":
+        """Read the manifest, or about `max_sets` sets of it: as many of each actor and rig.
 
         Raises:
             DataError: no readable manifest, or one without rows.
         """
-        rows = read_table(folder / "manifest.parquet", schema=schemas.MANIFEST)
-        if not rows:
+        manifest = ManifestReader(folder)
+        if not manifest.num_rows:
             raise DataError(f"{folder}/manifest.parquet: no rows; rerun the render stage")
-        return cls(folder, tuple(rows))
+        counts = Counter(_stratum(key) for key, _ in manifest.sets())
+        numbers = [n for run in _spread(manifest, counts, max_sets=max_sets) for n in run]
+        return cls(folder, tuple(manifest.rows(numbers)), manifest.num_rows, counts.total())
 
     @property
     def name(self) -> str:
         """The dataset's name is its folder's."""
         return self.folder.resolve().name
 
-    def of(self, actor: ActorFolders) -> list[Row]:
-        """The rows of one actor."""
-        return [r for r in self.rows if (r["source"], r["actor"]) == (actor.source, actor.actor)]
+    def rows_with(self, sample_ids: Collection[str]) -> Iterator[Row]:
+        """The rows of the whole manifest that have these ids."""
+        manifest = ManifestReader(self.folder)
+        return manifest.rows(manifest.numbers_of(sample_ids))
 
     @cached_property
     def sets(self) -> dict[SetKey, dict[str, Row]]:
@@ -69,26 +85,43 @@ class Dataset:
         return self.folder / row[column]
 
 
-def actor_folders(
-    captures: list[Path], *, mattes: list[Path], bodies: list[Path], avatars: list[Path]
-) -> list[ActorFolders]:
-    """The folders of every actor; all lists name the actors in the same order.
+def _stratum(key: SetKey) -> tuple[str, str, str]:
+    return key.source, key.actor, key.rig
 
-    A folder ends in `{source}/{actor}`.
 
-    Raises:
-        DataError: the lists differ in length or name different actors.
-    """
-    given = {"mattes": mattes, "bodies": bodies, "avatars": avatars}
-    for name, folders in given.items():
-        keys = [folder.parts[-2:] for folder in folders]
-        expected = [folder.parts[-2:] for folder in captures]
-        if keys != expected:
-            raise DataError(
-                f"evaluate: {name} belong to {['/'.join(k) for k in keys]}, captures to "
-                f"{['/'.join(k) for k in expected]}; give one folder per actor, in one order"
-            )
-    return [
-        ActorFolders(*paths[0].parts[-2:], *paths)
-        for paths in zip(captures, mattes, bodies, avatars, strict=True)
-    ]
+def _spread(
+    manifest: ManifestReader, counts: Counter[tuple[str, str, str]], *, max_sets: int
+) -> Iterator[range]:
+    """Row numbers of the sampled sets: all, or equally many of each stratum, evenly spaced."""
+    share = math.ceil(max_sets / len(counts)) if counts.total() > max_sets else counts.total()
+    seen: Counter[tuple[str, str, str]] = Counter()
+    for key, rows in manifest.sets():
+        stratum = _stratum(key)
+        count, position = counts[stratum], seen[stratum]
+        seen[stratum] += 1
+        # exactly min(share, count) positions are steps of this stair
+        if count <= share or (position + 1) * share // count > position * share // count:
+            yield rows
+
+
+@dataclass(frozen=True)
+class ResultFolders:
+    """The stages' result folders, each with `{source}/{actor}` below it."""
+
+    captures: Path
+    masks: Path
+    fits: Path
+    avatars: Path
+
+    def of(self, actor: Actor, *, provides: Collection[Given]) -> ActorFolders:
+        """The folders of one actor; what its source provides lies with the capture."""
+        key = f"{actor.source}/{actor.actor}"
+        return ActorFolders(
+            source=actor.source,
+            actor=actor.actor,
+            capture=self.captures / key,
+            mattes=(self.captures if "masks" in provides else self.masks) / key,
+            bodies=(self.captures if "bodies" in provides else self.fits) / key,
+            avatar=self.avatars / key,
+            gender=actor.gender,
+        )

@@ -45,7 +45,7 @@ def headline(dataset: Dataset) -> str:
     """How many images of how many people."""
     people = len({(row["source"], row["actor"]) for row in dataset.rows})
     noun = "person" if people == 1 else "people"
-    return f"{len(dataset.rows):,} images of {people} {noun}, seen from the ceiling"
+    return f"{dataset.num_images:,} images of {people} {noun}, seen from the ceiling"
 
 
 def lead(dataset: Dataset) -> str:
@@ -54,7 +54,7 @@ def lead(dataset: Dataset) -> str:
     rigs = sorted({r["rig"] for r in dataset.rows})
     degrees = 2 * row["max_theta_rad"] * 57.29577951308232
     return (
-        f"Dataset “{dataset.name}”: {len(dataset.sets):,} sets, one body pose each, seen by nine "
+        f"Dataset “{dataset.name}”: {dataset.num_sets:,} sets, one body pose each, seen by nine "
         f"{row['camera_model'].replace('_', '-')} fisheye cameras "
         f"({row['width']} × {row['height']} px, {degrees:.0f}°) in {len(rigs)} camera "
         f"{'setting' if len(rigs) == 1 else 'settings'}, with masks, depth, "

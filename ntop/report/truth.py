@@ -54,7 +54,7 @@ def score_truth(dataset: Dataset, actor: ActorFolders, *, paint: Painter) -> Tru
     """
     truth = truth_rows(actor)
     rows, scores = [], []
-    known = [row for row in dataset.of(actor) if row["sample_id"] in truth]
+    known = list(dataset.rows_with(truth)) if truth else []
     what = f"evaluate: truth of {actor.name}"
     for row in paced(known, what=what, total=len(known), unit="images"):
         true_row = truth[row["sample_id"]]

@@ -12,7 +12,7 @@ STAGES = (
     (5, "render", 3),
     (6, "annotate", 1),
     (7, "assemble", 1),
-    (8, "evaluate", 2),
+    (8, "evaluate", 3),
 )
 
 VERSIONS = {name: version for _, name, version in STAGES}

@@ -10,6 +10,7 @@ import numpy as np
 from ntop.body.model import BodyModel, load_body_model
 from ntop.body.skinning import BodyPose
 from ntop.config.sections import EvaluateConfig
+from ntop.config.tables import Actor, read_tsv
 from ntop.conventions import ConfigError, DataError
 from ntop.field.avatar import load_avatar
 from ntop.field.rendering import pose_avatar, render_view
@@ -36,7 +37,7 @@ from ntop.report.heldout import (
     heldout_values,
     score_heldout,
 )
-from ntop.report.inputs import ActorFolders, Dataset, actor_folders
+from ntop.report.inputs import ActorFolders, Dataset, ResultFolders
 from ntop.report.making import making_strip
 from ntop.report.mesh import painted_body
 from ntop.report.page import Comparison, Page, Strip, write_page
@@ -73,44 +74,50 @@ class ActorReport:
 def main(
     config: EvaluateConfig,
     dataset: Path,
-    captures: list[Path],
-    mattes: list[Path],
-    bodies: list[Path],
-    avatars: list[Path],
+    actors: Path,
+    captures: Path,
+    masks: Path,
+    fits: Path,
+    avatars: Path,
     benchmarks: Path,
     out: Path,
 ) -> None:
     """Write metrics.json, report.html and the folder `exhibits` (for `snakemake --report`).
 
-    `captures`, `mattes`, `bodies` and `avatars` hold one folder `.../{source}/{actor}` per actor,
-    in one order; `benchmarks` is the folder of Snakemake's benchmark tables.
+    `actors` is the table of all actors; `captures`, `masks`, `fits` and `avatars` are the stages'
+    folders with `{source}/{actor}` below; `benchmarks` has Snakemake's benchmark tables. Checks and
+    pictures are of all sets, or of `config.max_sets` in a larger dataset.
 
     Raises:
-        DataError: a result is missing or damaged, or the folders name different actors.
+        DataError: a result is missing or damaged.
     """
     started = time.monotonic()
-    actors = actor_folders(captures, mattes=mattes, bodies=bodies, avatars=avatars)
-    check_files(*captures, *mattes, *bodies, *avatars)
-    assembled = Dataset.read(dataset)
-    in_turn = paced(actors, what="evaluate", total=len(actors), unit="actors")
+    roots = ResultFolders(captures, masks, fits, avatars)
+    folders = [
+        roots.of(row, provides=config.provides.get(row.source, ()))
+        for row in read_tsv(actors, Actor)
+    ]
+    check_files(*(p for a in folders for p in (a.capture, a.mattes, a.bodies, a.avatar)))
+    assembled = Dataset.read(dataset, max_sets=config.max_sets)
+    in_turn = paced(folders, what="evaluate", total=len(folders), unit="actors")
     reports = {actor.name: report_actor(config, assembled, actor) for actor in in_turn}
     record = read_dataset_record(assembled)
     values = mean_values([report.values for report in reports.values()])
     values |= dataset_values(assembled)
-    checks = check_stripes(assembled, actors, model_of=lambda actor: body_model_of(config, actor))
+    checks = check_stripes(assembled, folders, model_of=lambda actor: body_model_of(config, actor))
     values |= stripe_values(checks)
     exhibits = [item for report in reports.values() for item in report.exhibits]
     measured = stage_costs(benchmarks, actors=set(reports), dataset=assembled.name)
     costs = with_own(measured, started=started)
-    table = cost_table(costs, num_images=len(assembled.rows))
+    table = cost_table(costs, num_images=assembled.num_images)
     exhibits += dataset_exhibits(
         assembled,
         statistics=statistics_table(record),
-        left_out=left_out_table(record, actors),
+        left_out=left_out_table(record, folders),
         costs=table,
     )
     values |= cost_values(costs)
-    page = compose(assembled, actors, reports=reports, values=complete(values))
+    page = compose(assembled, folders, reports=reports, values=complete(values))
     page = replace(
         page,
         costs=cost_charts(costs),
@@ -152,7 +159,7 @@ def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) 
 
 def body_model_of(config: EvaluateConfig, actor: ActorFolders) -> BodyModel:
     """The body model that the actor was fitted with."""
-    file = config.body_models.get(actor.name)
+    file = config.body_models.get(actor.source, {}).get(actor.gender)
     return load_body_model(Path(file) if file else None)
 
 
@@ -205,7 +212,8 @@ def dataset_values(dataset: Dataset) -> Values:
     return {
         "labels.blob_max_px": blob_max_px(dataset),
         "labels.reprojection_max_px": reprojection_max_px(dataset),
-        "dataset.images": len(dataset.rows),
+        "dataset.images": dataset.num_images,
+        "checks.images": len(dataset.rows),
         "checks.coco_self_ap": coco_self_ap(dataset),
         "checks.rle_equals_mask": checks.rle_equals_mask,
         "checks.visible_on_mask": checks.visible_on_mask,

@@ -6,7 +6,7 @@ unclipped projection in our convention. Loaders ignore the extra keys.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,11 @@ from ntop.body.skeletons import (
     SMPL24_NAMES,
     SMPL24_SIGMAS,
 )
-from ntop.conventions import PIXEL_CENTRE
+from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.storage.tables import Row
 
 CATEGORY_ID = 1
+COPIED_CHARS = 1 << 16  # at a time, when the two halves of a file are joined
 
 
 @dataclass(frozen=True)
@@ -143,10 +144,50 @@ def coco_writer(path: Path, *, skeleton: Skeleton, info: dict[str, Any]) -> Iter
         yield CocoWriter(images, annotations, skeleton)
         images.write('\n],\n"annotations":[')
         annotations.seek(0)
-        while block := annotations.read(1 << 20):
+        while block := annotations.read(COPIED_CHARS):
             images.write(block)
         images.write("\n]}\n")
     rest.unlink()
+
+
+def read_coco(path: Path, *, file_names: Container[str]) -> dict[str, Any]:
+    """The part of a COCO file that is about some images; the others cost no memory.
+
+    Relies on what `CocoWriter` does: one record per line.
+
+    Raises:
+        DataError: it cannot be read, or another program has laid it out anew.
+    """
+    document: dict[str, Any] = {"categories": [], "images": [], "annotations": []}
+    ids, section = set(), ""
+    try:
+        with path.open() as stream:
+            for line in stream:
+                if line.startswith('"'):
+                    section, rest = line.split('":', 1)
+                    section = section[1:]
+                    if section == "categories":
+                        document[section] = json.loads(rest.rstrip(",\n"))
+                elif not line.startswith("{"):
+                    continue
+                elif section == "images" and _between(line, '"file_name":"', '"') in file_names:
+                    record = json.loads(line.rstrip(",\n"))
+                    ids.add(record["id"])
+                    document[section].append(record)
+                elif section == "annotations" and int(_between(line, '"image_id":', ",")) in ids:
+                    document[section].append(json.loads(line.rstrip(",\n")))
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read {path}: {error}; rerun the assemble stage") from error
+    if section != "annotations":
+        raise DataError(
+            f'{path}: no line that starts with "annotations"; expected one record per line, as '
+            "assemble writes them: it is cut off or was laid out anew, rerun the assemble stage"
+        )
+    return document
+
+
+def _between(line: str, before: str, after: str) -> str:
+    return line.partition(before)[2].partition(after)[0]
 
 
 def _append(stream: TextIO, record: dict[str, Any], *, first: bool) -> None:

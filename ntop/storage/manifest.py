@@ -1,18 +1,24 @@
-"""The manifest: one row per image, written in row groups so that memory stays bounded."""
+"""The manifest: one row per image, written and read in row groups so that memory stays bounded."""
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from ntop.conventions import DataError
 from ntop.storage import schemas
-from ntop.storage.tables import Row
+from ntop.storage.keys import SetKey
+from ntop.storage.renders import set_key
+from ntop.storage.tables import Row, completed
 
 ROWS_PER_GROUP = 4096  # a row takes about 10 kB in memory
 
 MANIFEST_NAME = "manifest.parquet"
+SET_COLUMNS = ["source", "actor", "action", "rig", "frame"]
 
 
 class ManifestWriter:
@@ -48,3 +54,70 @@ def manifest_writer(folder: Path) -> Iterator[ManifestWriter]:
         rows = ManifestWriter(writer)
         yield rows
         rows.flush()
+
+
+class ManifestReader:
+    """The manifest of a dataset, read piece by piece: nothing grows with the number of images."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open `manifest.parquet` in a dataset's folder.
+
+        Raises:
+            DataError: the file is missing, damaged, or has other columns than expected.
+        """
+        path = folder / MANIFEST_NAME
+        try:
+            self._file = pq.ParquetFile(path)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise DataError(
+                f"cannot read table {path}: {error}; delete it and rerun the assemble stage"
+            ) from error
+        names = self._file.schema_arrow.names
+        if completed(self._file.schema_arrow.empty_table(), schemas.MANIFEST).schema.names != (
+            schemas.MANIFEST.names
+        ):
+            raise DataError(
+                f"{path}: columns {names}, expected "
+                f"{schemas.MANIFEST.names}; it was written by another version: rerun assemble"
+            )
+
+    @property
+    def num_rows(self) -> int:
+        """Images of the dataset."""
+        return self._file.metadata.num_rows
+
+    def sets(self) -> Iterator[tuple[SetKey, range]]:
+        """Each set with the numbers of its rows, in the manifest's order."""
+        known, first, number = None, 0, 0
+        for batch in self._file.iter_batches(ROWS_PER_GROUP, columns=SET_COLUMNS):
+            for row in batch.to_pylist():
+                key = set_key(row)
+                if key != known:
+                    if known is not None:
+                        yield known, range(first, number)
+                    known, first = key, number
+                number += 1
+        if known is not None:
+            yield known, range(first, number)
+
+    def numbers_of(self, sample_ids: Collection[str]) -> list[int]:
+        """The numbers of the rows with these sample ids, ascending."""
+        wanted, found, first = pa.array(list(sample_ids), pa.string()), [], 0
+        for batch in self._file.iter_batches(ROWS_PER_GROUP, columns=["sample_id"]):
+            inside = pc.is_in(batch.column(0), wanted)
+            found += (first + position for position in pc.indices_nonzero(inside).to_pylist())
+            first += batch.num_rows
+        return found
+
+    def rows(self, numbers: list[int]) -> Iterator[Row]:
+        """The rows with these ascending numbers."""
+        first, left = 0, deque(numbers)
+        for group in range(self._file.num_row_groups):
+            end = first + self._file.metadata.row_group(group).num_rows
+            inside = []
+            while left and left[0] < end:
+                inside.append(left.popleft() - first)
+            if inside:
+                table = self._file.read_row_group(group).take(inside)
+                yield from completed(table, schemas.MANIFEST).to_pylist()
+            first = end

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ntop.storage.atomic import write_bytes
+from ntop.conventions import DataError
 from ntop.storage.files import content_row
 from ntop.storage.tables import Row
 
@@ -50,10 +50,34 @@ def set_record(rows: list[Row], *, body: Row) -> dict[str, Any]:
     }
 
 
+def set_path(row: Row) -> str:
+    """Where a set's file lies in a dataset, from its record or any of its manifest rows."""
+    place = "/".join(row[key] for key in ("split", "source", "actor", "action", "rig"))
+    return f"sets/{place}/{row['frame']:06d}.json"
+
+
+def read_set(row: Row, *, folder: Path) -> dict[str, Any]:
+    """The record of the set that a manifest row belongs to.
+
+    Raises:
+        DataError: the file is missing or not JSON.
+    """
+    path = folder / set_path(row)
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read {path}: {error}; rerun the assemble stage") from error
+
+
 def write_set(record: dict[str, Any], *, folder: Path) -> Row:
-    """Write a set's file below `sets/`; returns its record (schema FILE) there."""
-    place = "/".join(record[key] for key in ("split", "source", "actor", "action", "rig"))
-    name = f"sets/{place}/{record['frame']:06d}.json"
+    """Write a set's file below `sets/`; returns its record (schema FILE) there.
+
+    Not atomic: a dataset is built in a work folder and published as a whole. Waiting for the disk
+    after each of 63 thousand files would take longer than all the rest.
+    """
+    name = set_path(record)
     content = (json.dumps(record, separators=(",", ":"), allow_nan=False) + "\n").encode()
-    write_bytes(folder / name, content)
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
     return content_row(name, content)

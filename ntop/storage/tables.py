@@ -41,20 +41,29 @@ def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
     Raises:
         DataError: the file is missing, truncated, or has other columns than expected.
     """
+    return load_table(path, schema=schema).to_pylist()
+
+
+def load_table(path: Path, *, schema: pa.Schema) -> pa.Table:
+    """A table as Arrow's columns, after a check of its schema.
+
+    Raises:
+        DataError: the file is missing, truncated, or has other columns than expected.
+    """
     try:
         table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
-    table = _completed(table, schema)
+    table = completed(table, schema)
     if table.schema.names != schema.names:
         raise DataError(
             f"{path}: columns {table.schema.names}, expected {schema.names}; "
             f"it was written by another version: {remedy(path)}"
         )
-    return table.cast(schema).to_pylist()
+    return table.cast(schema)
 
 
-def _completed(table: pa.Table, schema: pa.Schema) -> pa.Table:
+def completed(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """The table with the columns that its schema got later, as nulls."""
     later = [name for name, _ in schemas.LENS_COLUMNS]
     if [*table.schema.names, *later] != schema.names:

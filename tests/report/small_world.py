@@ -49,6 +49,13 @@ class World:
     dataset: Path
     benchmarks: Path
 
+    def actors_table(self) -> Path:
+        """The table of the two actors, as a configuration names it."""
+        path = self.root / "actors.tsv"
+        lines = [f"{actor.source}\t{actor.actor}\tval\n" for actor in self.actors]
+        path.write_text("source\tactor\tsplit\n" + "".join(lines))
+        return path
+
     @property
     def studio(self) -> ActorFolders:
         return next(actor for actor in self.actors if actor.source == "studio")

@@ -1,18 +1,20 @@
+from pathlib import Path
+
 import pytest
 
+from ntop.config.tables import Actor
 from ntop.conventions import DataError
-from ntop.report.inputs import Dataset, actor_folders
+from ntop.report.inputs import Dataset, ResultFolders
 
 
-def test_folders_are_paired_by_actor(world):
-    captures = [actor.capture for actor in world.actors]
-    avatars = [actor.avatar for actor in world.actors]
-    found = actor_folders(captures, mattes=captures, bodies=captures, avatars=avatars)
-    assert found == list(world.actors)
-    with pytest.raises(DataError, match="one order"):
-        actor_folders(captures, mattes=captures, bodies=captures, avatars=avatars[::-1])
-    with pytest.raises(DataError, match="one order"):
-        actor_folders(captures, mattes=captures[:1], bodies=captures, avatars=avatars)
+def test_what_a_source_provides_lies_with_its_capture():
+    roots = ResultFolders(Path("c"), Path("m"), Path("f"), Path("a"))
+    actor = Actor(source="lab", actor="ada", split="val")
+    computed = roots.of(actor, provides=())
+    assert (computed.capture, computed.mattes) == (Path("c/lab/ada"), Path("m/lab/ada"))
+    assert (computed.bodies, computed.avatar) == (Path("f/lab/ada"), Path("a/lab/ada"))
+    given = roots.of(actor, provides=("masks", "bodies"))
+    assert (given.mattes, given.bodies) == (Path("c/lab/ada"), Path("c/lab/ada"))
 
 
 def test_the_dataset_knows_its_sets(world):
@@ -20,6 +22,25 @@ def test_the_dataset_knows_its_sets(world):
     assert dataset.name == "tiny"
     assert len(dataset.rows) == 36
     assert [len(views) for views in dataset.sets.values()] == [9, 9, 9, 9]
-    assert len(dataset.of(world.studio)) == 18
+    assert (dataset.num_images, dataset.num_sets) == (36, 4)
     with pytest.raises(DataError, match="cannot read table"):
         Dataset.read(world.root)
+
+
+@pytest.mark.parametrize("max_sets", [2, 3, 4])
+def test_a_sample_has_whole_sets_of_every_actor(world, max_sets):
+    whole = Dataset.read(world.dataset)
+    sample = Dataset.read(world.dataset, max_sets=max_sets)
+    assert (sample.num_images, sample.num_sets) == (36, 4)
+    per_actor = {2: 1, 3: 2, 4: 2}[max_sets]  # two actors, one rig
+    assert len(sample.sets) == 2 * per_actor
+    for key, views in sample.sets.items():
+        assert views == whole.sets[key]
+
+
+def test_rows_are_found_by_their_ids_beyond_the_sample(world):
+    whole = Dataset.read(world.dataset)
+    sample = Dataset.read(world.dataset, max_sets=1)
+    wanted = whole.rows[4::7]
+    ids = [row["sample_id"] for row in wanted]
+    assert list(sample.rows_with([*ids[::-1], "unknown"])) == list(wanted)

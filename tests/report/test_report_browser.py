@@ -73,12 +73,13 @@ def probed(answer):
 def report(world, tmp_path_factory):
     out = tmp_path_factory.mktemp("browser") / "tiny"
     s8_evaluate.main(
-        EvaluateConfig(),
+        EvaluateConfig(provides={a.source: ("masks", "bodies") for a in world.actors}),
         dataset=world.dataset,
-        captures=[actor.capture for actor in world.actors],
-        mattes=[actor.mattes for actor in world.actors],
-        bodies=[actor.bodies for actor in world.actors],
-        avatars=[actor.avatar for actor in world.actors],
+        actors=world.actors_table(),
+        captures=world.root / "1_capture",
+        masks=world.root / "2_mask",
+        fits=world.root / "3_fit",
+        avatars=world.root / "4_train",
         benchmarks=world.benchmarks,
         out=out,
     )

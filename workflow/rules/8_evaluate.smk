@@ -7,6 +7,7 @@ rule evaluate:
         bodies=actor_folders(body_folder),
         avatars=[f"results/4_train/{actor.source}/{actor.actor}" for actor in ACTORS],
         references=reference_mask_files,
+        actors=CONFIG.actors,
     output:
         report(
             directory("results/8_evaluate/{dataset}"),
@@ -30,6 +31,6 @@ rule evaluate:
         benchmarks="results/benchmarks",
     shell:
         "NUMBA_NUM_THREADS={threads} exec ntop evaluate --config {params.config:q} --dataset {input.dataset:q}"
-        " --captures {input.captures:q} --mattes {input.mattes:q} --bodies {input.bodies:q}"
-        " --avatars {input.avatars:q} --benchmarks {params.benchmarks:q}"
+        " --actors {input.actors:q} --captures results/1_capture --masks results/2_mask"
+        " --fits results/3_fit --avatars results/4_train --benchmarks {params.benchmarks:q}"
         " --out {output:q} 2> {log:q}"

@@ -217,8 +217,14 @@ def evaluate_params(wildcards):
             if section.reference_masks
         },
     }
-    files = {f"{row.source}/{row.actor}": body_model_of(CONFIG, row) for row in ACTORS}
-    extra["body_models"] = {name: path for name, path in files.items() if path}
+    provides = {name: section.provides for name, section in sections.items()}
+    extra["provides"] = {name: list(given) for name, given in provides.items() if given}
+    files = {
+        name: getattr(section, "body_models", {}) for name, section in sections.items()
+    }
+    extra["body_models"] = {
+        name: by_gender for name, by_gender in files.items() if by_gender
+    }
     return params_json("evaluate", None, extra)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -34,16 +34,16 @@ from ntop.storage.bodies import body_pose_from_rows, read_bodies
 from ntop.storage.files import check_files, find_damage, read_records, record_files
 from ntop.storage.images import write_depth, write_parts, write_rgba
 from ntop.storage.keys import SetKey
-from ntop.storage.links import link_or_copy
 from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
-from ntop.storage.renders import IMAGE_FOLDERS, body_columns, image_paths, render_row
-from ntop.storage.tables import Row, read_table, write_table
+from ntop.storage.renders import body_columns, image_paths, render_row
+from ntop.storage.shards import RENDERS_NAME, store_archive, store_files
+from ntop.storage.tables import Row, write_table
 from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, work_folder
 
 STAGE = "render"
 CLIPS = "pybullet"  # the package that novel motions come from
 FRAME_RATE_HZ = 30.0  # of novel motions; recorded ones have the capture's frames
-RENDERS_NAME, SKIPPED_NAME = "renders.parquet", "skipped.json"
+SKIPPED_NAME = "skipped.json"
 
 
 def main(
@@ -63,8 +63,9 @@ def main(
     """Render one shard: the sets `frames` of (source, actor, action, rig) into folder `out`.
 
     `motion` is empty for the recorded poses of `action`, else the name of a motion that is
-    retargeted to the actor's shape. `out` gets renders.parquet (schema RENDER), images/, depth/,
-    parts/, provenance.json and skipped.json, the frames without a usable body and why.
+    retargeted to the actor's shape. `out` gets renders.parquet (schema RENDER), images/, depth/ and
+    parts/ (or pictures.tar with `storage: tar`), provenance.json and skipped.json, the frames
+    without a usable body and why.
 
     Raises:
         ConfigError: unknown rig or motion.
@@ -111,7 +112,8 @@ def main(
         record = provenance(
             stage=STAGE, version=VERSIONS[STAGE], config=recipe["config"], inputs=inputs
         )
-        publish(usable, skipped, record, content=content, out=out)
+        done = [set_folder(content, key) for key in usable]
+        publish(done, skipped, record, storage=config.storage, out=out)
         clear_work(work)
 
 
@@ -248,19 +250,17 @@ def write_view(rendering: Rendering, paths: dict[str, Path]) -> str:
 
 
 def publish(
-    keys: list[SetKey], skipped: list[Row], record: dict[str, Any], *, content: Path, out: Path
+    done: list[Path],
+    skipped: list[Row],
+    record: dict[str, Any],
+    *,
+    storage: Literal["files", "tar"],
+    out: Path,
 ) -> None:
-    """Make the shard's folder from its finished sets, by one rename."""
-    rows, files = [], []
+    """Make the shard's folder from the folders of its finished sets, by one rename."""
+    store = {"files": store_files, "tar": store_archive}[storage]
     with atomic_folder(out) as folder:
-        for key in keys:
-            done = set_folder(content, key)
-            # recorded when they were rendered: what has become of them since must not be believed
-            files += [row for name, row in read_records(done).items() if name != RENDERS_NAME]
-            for row in read_table(done / RENDERS_NAME, schema=schemas.RENDER):
-                rows.append(row)
-                for column in IMAGE_FOLDERS:
-                    link_or_copy(done / row[column], folder / row[column])
+        rows, files = store(done, folder=folder)
         write_table(rows, schema=schemas.RENDER, path=folder / RENDERS_NAME)
         text = json.dumps(skipped, indent=1, sort_keys=True) + "\n"
         write_bytes(folder / SKIPPED_NAME, text.encode())

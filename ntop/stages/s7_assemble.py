@@ -15,6 +15,7 @@ from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.metrics.statistics import Tally, statistics_rows, statistics_table
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
+from ntop.storage.archives import member_at
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.card import dataset_card
 from ntop.storage.coco import COCO17, SMPL24, CocoWriter, coco_writer
@@ -31,8 +32,9 @@ from ntop.storage.manifest import ManifestWriter, manifest_writer
 from ntop.storage.pace import paced
 from ntop.storage.provenance import code_sha256, json_sha256
 from ntop.storage.remedies import FILES_NAME, remedy
-from ntop.storage.renders import IMAGE_FOLDERS, set_key
+from ntop.storage.renders import set_key
 from ntop.storage.sets import set_record, write_set
+from ntop.storage.shards import PicturePlaces, picture_places
 from ntop.storage.tables import Row, read_table
 
 SPLITS = ("train", "val")
@@ -54,6 +56,7 @@ class Totals:
 
     tallies: dict[tuple[str, str], Tally] = field(default_factory=dict)
     num_sets: int = 0
+    archives: bool = False  # whether pictures are in tars
 
 
 def main(
@@ -73,7 +76,11 @@ def main(
     keys = shard_frames(
         read_tsv(sequences, Sequence), rigs=config.rigs, sets_per_shard=config.sets_per_shard
     )
-    shards = [Shard(renders / key, annotations / f"{key}.parquet") for key in keys]
+    # by source, actor, action, rig and first frame: the manifest is sorted without reading ahead
+    shards = [
+        Shard(renders / key, annotations / f"{key}.parquet")
+        for key in sorted(keys, key=lambda key: key.split("/"))
+    ]
     totals = Totals()
     with atomic_folder(out) as folder, files_writer(folder) as files:
         with ExitStack() as stack:
@@ -89,8 +96,7 @@ def main(
                 for skeleton, name in COCO_NAMES.items()
                 for split in SPLITS
             }
-            ordered = in_order(shards)
-            for shard in paced(ordered, what="assemble", total=len(ordered), unit="shards"):
+            for shard in paced(shards, what="assemble", total=len(shards), unit="shards"):
                 rows = add_shard(
                     shard, actors=actors, folder=folder, manifest=manifest, coco=coco, totals=totals
                 )
@@ -118,22 +124,6 @@ def actors_by_key(config: AssembleConfig) -> dict[tuple[str, str], Actor]:
     return actors
 
 
-def in_order(shards: list[Shard]) -> list[Shard]:
-    """Shards by source, actor, action, rig and first frame, so that the manifest is sorted.
-
-    A shard without a usable frame adds no row and is left out.
-    """
-    keyed = []
-    for shard in shards:
-        check_files(shard.renders, only={"renders.parquet", "skipped.json"})
-        rows = read_table(shard.renders / "renders.parquet", schema=schemas.RENDER)
-        if rows:
-            first = rows[0]
-            key = tuple(first[name] for name in ("source", "actor", "action", "rig", "frame"))
-            keyed.append((key, shard))
-    return [shard for _, shard in sorted(keyed, key=lambda pair: pair[0])]
-
-
 def add_shard(
     shard: Shard,
     *,
@@ -148,7 +138,9 @@ def add_shard(
     Raises:
         DataError: a file of the shard is not what was rendered.
     """
-    records, files = read_records(shard.renders), []
+    check_files(shard.renders, only={"renders.parquet", "skipped.json"})
+    records = read_records(shard.renders)
+    files: dict[str, Row] = {}
     for pairs in sets_of(shard):
         body = pairs[0][0]
         actor = actors.get((body["source"], body["actor"]))
@@ -159,18 +151,21 @@ def add_shard(
             )
         rows = []
         for render, annotated in pairs:
-            row = manifest_row(render, persons=annotated["persons"], split=actor.split)
-            for column in IMAGE_FOLDERS:
-                record = records.get(render[column])
+            places = picture_places(render, split=actor.split, shard=shard.renders.name)
+            for source, target in places.links.items():
+                if target in files:
+                    continue  # a tar, linked with its first picture
+                record = records.get(source)
                 if record is None:
                     raise DataError(
-                        f"{shard.renders} has no record of {render[column]}: another version of "
-                        f"ntop rendered it; {remedy(shard.renders)}"
+                        f"{shard.renders} has no record of {source}: another version of ntop "
+                        f"rendered it; {remedy(shard.renders)}"
                     )
                 # the last look: whatever damages a picture later is the dataset's, not the run's
                 raise_damage(find_damage(shard.renders, record), shard.renders)
-                link_or_copy(shard.renders / render[column], folder / row[column])
-                files.append(record | {"path": row[column]})
+                link_or_copy(shard.renders / source, folder / target)
+                files[target] = record | {"path": target}
+            row = manifest_row(render, places, persons=annotated["persons"], split=actor.split)
             manifest.add(row)
             rows.append(row)
             for skeleton, points in (
@@ -185,9 +180,11 @@ def add_shard(
                 (actor.source, actor.actor, actor.gender),
                 sizes_px=[tuple(person["bbox_xywh_px"][2:]) for person in row["persons"]],
             )
-        files.append(write_set(set_record(rows, body=body), folder=folder))
+        written = write_set(set_record(rows, body=body), folder=folder)
+        files[written["path"]] = written
         totals.num_sets += 1
-    return files
+        totals.archives = totals.archives or member_at(rows[0]["image_path"]) is not None
+    return list(files.values())
 
 
 def sets_of(shard: Shard) -> Iterator[list[tuple[Row, Row]]]:
@@ -210,13 +207,10 @@ def sets_of(shard: Shard) -> Iterator[list[tuple[Row, Row]]]:
         yield [(row, annotated[row["sample_id"]]) for row in views]
 
 
-def manifest_row(render: Row, *, persons: list[Row], split: str) -> Row:
+def manifest_row(render: Row, places: PicturePlaces, *, persons: list[Row], split: str) -> Row:
     """The manifest's row of one view; paths become relative to the dataset's folder."""
-    key = set_key(render)
-    place = f"{split}/{key.folder()}/{key.image_name(render['view'])}"
     kept = {name: value for name, value in render.items() if name not in NOT_IN_MANIFEST}
-    paths = {column: f"{kind}/{place}" for column, kind in IMAGE_FOLDERS.items()}
-    return kept | paths | {"split": split, "persons": persons}
+    return kept | places.paths | {"split": split, "persons": persons}
 
 
 def write_summary(
@@ -251,5 +245,6 @@ def write_summary(
         num_images=num_images,
         num_sets=totals.num_sets,
         statistics=statistics_table(lines),
+        archives=totals.archives,
     )
     write_bytes(folder / "README.md", card.encode())

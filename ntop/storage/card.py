@@ -64,12 +64,42 @@ around the mask, in pixels (width×height). Splits are by actor: nobody is in bo
 """
 
 
+TAR_PAGE = """
+## Pictures in tars
+
+The pictures of a shard are one plain tar, for file systems that would refuse millions of files. The
+paths of manifest, COCO files and sets are addresses `path:offset:size`, in bytes: nothing has to
+be unpacked or scanned, also from several workers at once.
+
+```python
+def read_picture(dataset: str, address: str) -> bytes:
+    path, offset, size = address.rsplit(":", 2)
+    with open(f"{dataset}/{path}", "rb") as stream:
+        stream.seek(int(offset))
+        return stream.read(int(size))
+```
+
+`ntop.storage.archives.read_content` does the same and names a tar that is cut off. `tar xf` unpacks
+a shard to `{frame}_{view}.image.png`, `.depth.png` and `.parts.png`; with this order and these
+names a shard is a WebDataset shard as well.
+"""
+
+
 def dataset_card(
-    *, dataset: str, version: str, num_images: int, num_sets: int, statistics: str
+    *,
+    dataset: str,
+    version: str,
+    num_images: int,
+    num_sets: int,
+    statistics: str,
+    archives: bool,
 ) -> str:
-    """The text of a dataset's README.md; `statistics` is a Markdown table."""
+    """The text of a dataset's README.md; `statistics` is a Markdown table.
+
+    `archives` says whether the pictures are in tars.
+    """
     size_category = next((name for limit, name in SIZE_CATEGORIES if num_images < limit), "n>1M")
-    return TEMPLATE.format(
+    text = TEMPLATE.format(
         dataset=dataset,
         version=version,
         num_images=f"{num_images:,}",
@@ -77,3 +107,4 @@ def dataset_card(
         statistics=statistics,
         size_category=size_category,
     )
+    return text + TAR_PAGE if archives else text

@@ -3,6 +3,8 @@
 Values are rounded to nearest: truncation costs 6 dB of the 58.9 dB that 8 bits allow and darkens
 every image by half a level. Colours are stored straight (not multiplied by alpha), because at
 alpha 0.02 un-premultiplying eight bits is off by 26 levels.
+
+All readers take the address of a tar's member (`ntop.storage.archives`) as well as a file.
 """
 
 import hashlib
@@ -14,6 +16,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from ntop.conventions import DEPTH_STEP_M, DataError
+from ntop.storage.archives import read_content
 from ntop.storage.atomic import write_bytes
 from ntop.storage.png import decode_png, encode_png
 from ntop.storage.remedies import remedy
@@ -157,7 +160,7 @@ def _dilated(
 
 def _read(path: Path, *, channels: int, dtype: type) -> np.ndarray:
     try:
-        pixels = decode_png(path.read_bytes())
+        pixels = decode_png(read_content(path))
     except OSError as error:
         raise DataError(
             f"cannot read image {path}: {error.strerror or error}; {remedy(path)}"

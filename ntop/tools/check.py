@@ -21,6 +21,7 @@ from ntop.storage.files import Damage, find_damage, read_records
 from ntop.storage.manifest import MANIFEST_NAME
 from ntop.storage.remedies import FILES_NAME, output_of
 from ntop.storage.renders import IMAGE_FOLDERS
+from ntop.storage.shards import ARCHIVE_NAME
 from ntop.storage.tables import Row, read_table
 
 EXIT_DAMAGED = 1
@@ -147,10 +148,14 @@ def origin(path: Path, folder: Path) -> Path:
     if folder.parent.name != DATASETS or kind not in IMAGE_FOLDERS.values():
         return folder
     _split, *sequence, name = place
-    results = folder.parent.parent
-    for source in sorted(results.joinpath(SHARDS, *sequence).glob(f"*/{kind}/{name}")):
-        shard = source.parent.parent
-        record = read_records(shard).get(f"{kind}/{name}")
+    renders = (folder.parent.parent / SHARDS).joinpath(*sequence)
+    if path.suffix == ".tar":  # all pictures of a shard, and named after it
+        shards, source = [renders / path.stem], ARCHIVE_NAME
+    else:
+        source = f"{kind}/{name}"
+        shards = sorted(shard for shard in renders.glob("*") if (shard / source).exists())
+    for shard in shards:
+        record = read_records(shard).get(source)
         if record is not None and find_damage(shard, record) is not None:
             return shard
     return folder

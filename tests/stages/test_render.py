@@ -162,4 +162,4 @@ def test_unknown_rig_frame_actor_and_motion_say_what_there_is(shop):
 def test_an_unwritable_output_folder_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match="check"):
-        s5_render.publish([], [], {}, content=tmp_path, out=tmp_path / "file" / "shard")
+        s5_render.publish([], [], {}, storage="files", out=tmp_path / "file" / "shard")

@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint numerics chaos rulegraph
+.PHONY: env demo studio test lint bench-scale numerics chaos rulegraph
 
 env: $(VENV)/.ready
 
@@ -36,6 +36,17 @@ lint: env
 	$(RUN) snakefmt --check Snakefile workflow
 	$(RUN) lint-imports
 	$(RUN) snakemake --lint
+
+# a campaign's life at four sizes, hours on two cores; goes on where it was stopped
+SCALE_FOLDER ?= /tmp/ntop-scale
+bench-scale: env
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 1k tar
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 1k files
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k tar
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k files
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 100k tar
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 570k tar
+	$(RUN) python -m benchmarks.scale record $(SCALE_FOLDER)
 
 # the acceptance suite for arithmetic, with its measured margins written into docs/numerics.md
 numerics: env

@@ -177,6 +177,10 @@ class RenderConfig(BodySection):
 
     rigs: dict[str, RigConfig]
     image: ImageConfig = ImageConfig()
+    quality: Literal["draft", "default", "reference"] = Field(
+        default="default",
+        description="How exactly rays are integrated; docs/benchmarks.md has errors and times.",
+    )
     sets_per_shard: int = Field(default=10, ge=1)
     storage: Literal["files", "tar"] = Field(
         default="files",

@@ -257,6 +257,19 @@ def occupied_cells(grid: CanonicalGrid, *, raw_threshold: float, margin_m: float
     return Occupancy(np.ascontiguousarray(marked), origin, spacing)
 
 
+def dense_voxels(grid: CanonicalGrid, *, raw_threshold: float) -> Occupancy:
+    """The voxels in which raw density may exceed a threshold: one of their nodes does."""
+    blocks = np.zeros((*grid.bricks.shape, 4, 4, 4), bool)
+    dense = (grid.values[:, 0] > raw_threshold).reshape(-1, 4, 4, 4)
+    blocks[tuple(grid.positions[1:].T)] = dense[1:]
+    bx, by, bz = grid.bricks.shape
+    cells = blocks.transpose(0, 3, 1, 4, 2, 5).reshape(4 * bx, 4 * by, 4 * bz)
+    for axis in range(3):
+        source = np.moveaxis(cells, axis, 0)
+        source[:-1] |= source[1:]
+    return Occupancy(cells.astype(np.uint8), grid.origin, grid.voxel_m)
+
+
 def _as_bricks(nodes: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "bx by bz 4 4 4"]:
     bx, by, bz = (n // 4 for n in nodes.shape)
     return nodes.reshape(bx, 4, by, 4, bz, 4).transpose(0, 2, 4, 1, 3, 5)

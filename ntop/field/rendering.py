@@ -20,12 +20,13 @@ from ntop.field.canonical import (
     Occupancy,
     PartLabels,
     canonical_body,
+    dense_voxels,
     label_grid,
-    occupied_cells,
 )
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
+from ntop.field.kernels.tables import EMPTY_RAW
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
-from ntop.field.warp import PoseWarp, occupied, octant_radius_m, pose_warp
+from ntop.field.warp import PoseWarp, occupied, pose_warp, with_octants
 from ntop.geometry.cameras import Camera, Lens
 
 CELL_M = 0.012  # of the warp grid; a coarser one bends wrongly at joints (0.02: -0.6 dB)
@@ -40,19 +41,23 @@ class RenderSettings:
     """How exactly to march; every shortcut can be switched off, and costs at most its bound.
 
     Args:
-        step_m: Distance of samples.
+        step_m: Largest length of a piece of a ray; faces of voxels cut it as well.
         stop_transmittance: Light left at which a ray ends (0: never); bounds the colour's error.
-        colour_floor: Weight below which a sample adds no colour (0: all do).
-        raw_threshold: Raw density below which space counts as empty (-inf: nothing is skipped).
+        colour_floor: Weight below which a piece adds no colour (0: all do).
+        intervals: Jump over space that no warp cell covers.
+        cells: Jump over octants of cells in which the field is empty.
+        extent: How much of an octant is asked whether it is empty; less than 1 may miss density.
         crop: March only pixels that may see the body.
         edge_rays: 4: supersample edges; 1: one ray through every pixel's centre.
-        phase: Offset of all samples, in steps, for the phase-shift self-test.
+        phase: Offset of all pieces, in steps, for the phase-shift self-test.
     """
 
-    step_m: float = 0.003
+    step_m: float = 0.002
     stop_transmittance: float = 1e-3
     colour_floor: float = 1e-4
-    raw_threshold: float = -3.0
+    intervals: bool = True
+    cells: bool = True
+    extent: float = 1.0
     crop: bool = True
     edge_rays: int = 4
     phase: float = 0.5
@@ -71,13 +76,21 @@ class RenderSettings:
             )
 
 
+# chosen and measured by `make bench`: benchmarks/quadrature.py, docs/benchmarks.md
+PRESETS = {
+    "draft": RenderSettings(step_m=0.008, stop_transmittance=1e-2, colour_floor=1e-3, edge_rays=1),
+    "default": RenderSettings(),
+    "reference": RenderSettings(step_m=0.0005, stop_transmittance=1e-5, colour_floor=0.0),
+}
+
+
 @dataclass(frozen=True)
 class Rendering:
     """One view. `rgb` is straight (not premultiplied) and meaningful where alpha > 0.
 
     `depth_m` is the ray length at which half of the light is gone, `parts` holds label + 1; both
     are 0 outside the mask (alpha below one half). `window` (left, top, width, height) holds every
-    pixel with alpha > 0; all is zero outside. `evaluations` counts density look-ups.
+    pixel with alpha > 0; all is zero outside. `evaluations` counts voxels looked up.
     """
 
     rgb: Float[np.ndarray, "height width 3"]
@@ -121,10 +134,14 @@ def pose_avatar(
     settings = settings or RenderSettings()
     body = canonical_body(model, avatar.betas)
     warp = pose_warp(body, model, pose, cell_m=cell_m, reach_m=avatar.reach_m)
-    occupancy, labels = _shared(avatar, model, settings.raw_threshold, octant_radius_m(cell_m))
+    dense, labels = _shared(avatar, model)
+    if settings.cells:
+        tables = occupied(warp.tables, dense, extent=settings.extent)
+    else:
+        tables = with_octants(warp.tables, np.full_like(warp.tables.occupancy, 255))
     return PosedAvatar(
         grid=avatar.grid,
-        warp=replace(warp, tables=occupied(warp.tables, occupancy)),
+        warp=replace(warp, tables=tables),
         light=avatar.light.astype(np.float32),
         labels=labels,
     )
@@ -133,16 +150,14 @@ def pose_avatar(
 _SHARED: dict[tuple, tuple] = {}
 
 
-def _shared(
-    avatar: Avatar, model: BodyModel, raw_threshold: float, margin_m: float
-) -> tuple[Occupancy, PartLabels]:
-    """Occupancy and labels of an avatar, the same in every pose; kept for the last one."""
-    key = (id(avatar), id(model), raw_threshold, margin_m)
+def _shared(avatar: Avatar, model: BodyModel) -> tuple[Occupancy, PartLabels]:
+    """Dense voxels and labels of an avatar, the same in every pose; kept for the last one."""
+    key = (id(avatar), id(model))
     if key not in _SHARED:
         _SHARED.clear()
-        occupancy = occupied_cells(avatar.grid, raw_threshold=raw_threshold, margin_m=margin_m)
+        dense = dense_voxels(avatar.grid, raw_threshold=EMPTY_RAW)
         labels = label_grid(canonical_body(model, avatar.betas))
-        _SHARED[key] = (occupancy, labels, avatar, model)  # held, so that no id is used twice
+        _SHARED[key] = (dense, labels, avatar, model)  # held, so that no id is used twice
     return _SHARED[key][:2]
 
 
@@ -170,7 +185,7 @@ def trace_rays(
         posed.grid.tables(), posed.warp.tables, posed.light, posed.labels.values,
         posed.labels.origin, 1 / posed.labels.spacing_m, np.zeros(1, np.int64), origin[None],
         directions, np.full(count, settings.phase), settings.step_m, settings.stop_transmittance,
-        settings.colour_floor, colours, opacity, depth, parts, evaluations,
+        settings.colour_floor, settings.intervals, colours, opacity, depth, parts, evaluations,
     )  # fmt: skip
     if not (np.isfinite(colours).all() and np.isfinite(opacity).all()):
         raise DataError(

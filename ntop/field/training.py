@@ -311,8 +311,9 @@ def watched_psnr(
     render_rays(
         state.grid.tables(), tables, state.light.astype(np.float32), np.zeros((1, 1, 1), np.uint8),
         np.zeros(3), 1.0, batch.poses, batch.origins, batch.directions, np.full(count, 0.5),
-        _march_step(state, settings), 1e-3, 0.0, colours, opacity, np.empty(count, np.float32),
-        np.empty(count, np.uint8), np.zeros(-(-count // RAYS_PER_CHUNK), np.int64),
+        _march_step(state, settings), 1e-3, 0.0, True, colours, opacity,
+        np.empty(count, np.float32), np.empty(count, np.uint8),
+        np.zeros(-(-count // RAYS_PER_CHUNK), np.int64),
     )  # fmt: skip
     gain = state.gain[batch.cameras]
     seen = colours * np.exp(gain[:, 0]) + gain[:, 1] * opacity[:, None]

@@ -116,10 +116,16 @@ def seen_rays(
     light: Float[Tensor, "9 3"],
     *,
     step_m: float,
+    empty_density: float = 0.0,
 ) -> Composite:
-    """Rays through a field: activate after interpolation, shade, composite."""
+    """Rays through a field: activate after interpolation, shade, composite.
+
+    Training sees all density; rendering takes off `empty_density` (EMPTY_DENSITY), below which
+    space is empty. The rendering kernel's specification is this sum for steps that go to zero.
+    """
     occupied = raw[..., 0] > VOID_RAW
-    density = DENSITY_SCALE * torch.nn.functional.softplus(raw[..., 0])
+    activated = torch.nn.functional.softplus(raw[..., 0]) - empty_density
+    density = DENSITY_SCALE * activated.clamp(min=0)
     optical_depth = torch.where(occupied, density * step_m, torch.zeros_like(density))
     return composite(optical_depth, torch.sigmoid(raw[..., 1:]) * shade(light, normals))
 

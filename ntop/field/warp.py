@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
@@ -28,6 +28,7 @@ APART_M = 0.12  # canonical distance between a point's two places that are worth
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
 MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
+MAX_AWAY = 8  # blocks; how far a ray may jump over empty space at once
 STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
 
 
@@ -112,13 +113,24 @@ def pose_warp(
     return PoseWarp(tables, origin, cell_m)
 
 
-def occupied(tables: WarpTables, occupancy: Occupancy) -> WarpTables:
-    """The same warps, of one or several poses, that skip what the canonical occupancy rules out."""
+def occupied(tables: WarpTables, occupancy: Occupancy, *, extent: float = 0.0) -> WarpTables:
+    """The same warps, of one or several poses, that skip what the canonical occupancy rules out.
+
+    `extent` 1 looks at the whole of every octant: with the occupancy of `dense_voxels`, nothing
+    that is skipped has density. 0 looks at its centre, for an occupancy with a margin.
+    """
     found = np.empty_like(tables.occupancy)
-    octant_occupancy(tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, found)
+    octant_occupancy(
+        tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, extent, found
+    )
+    return with_octants(tables, found)
+
+
+def with_octants(tables: WarpTables, octants: UInt8[np.ndarray, " cell"]) -> WarpTables:
+    """The same warps with these octants to look at."""
     poses = range(len(tables.dims))
-    blocks = np.concatenate([_blocks(tables, found, p) for p in poses])
-    return tables._replace(occupancy=found, blocks=blocks)
+    blocks = np.concatenate([_blocks(tables, octants, p) for p in poses])
+    return tables._replace(occupancy=octants, blocks=blocks)
 
 
 def octant_radius_m(cell_m: float) -> float:
@@ -219,9 +231,26 @@ def _cells_near(squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: flo
 
 
 def _blocks(tables: WarpTables, occupancy: np.ndarray, pose: int) -> np.ndarray:
+    """How many blocks away the nearest occupied block is, per block, at most MAX_AWAY."""
     dims = tables.dims[pose]
     cells = tables.cells[tables.cell_offset[pose] :][: dims.prod()].reshape(dims)
     full = np.zeros(4 * ((dims + 3) // 4), bool)
     full[: dims[0], : dims[1], : dims[2]] = (cells >= 0) & (occupancy[cells] != 0)
     bx, by, bz = (n // 4 for n in full.shape)
-    return full.reshape(bx, 4, by, 4, bz, 4).any(axis=(1, 3, 5)).ravel().astype(np.uint8)
+    near = full.reshape(bx, 4, by, 4, bz, 4).any(axis=(1, 3, 5))
+    away = np.zeros(near.shape, np.uint8)
+    for _ in range(MAX_AWAY):
+        away += ~near
+        near = _grown(near)
+    return away.ravel()
+
+
+def _grown(marked: np.ndarray) -> np.ndarray:
+    """Also the 26 neighbours."""
+    for axis in range(3):
+        source = np.moveaxis(marked, axis, 0)
+        grown = source.copy()
+        grown[1:] |= source[:-1]
+        grown[:-1] |= source[1:]
+        marked = np.moveaxis(grown, 0, axis)
+    return marked

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, occupied_cells
-from ntop.field.kernels.tables import VOID_RAW
+from ntop.field.canonical import CanonicalGrid, PartLabels, dense_voxels, number_bricks
+from ntop.field.kernels.tables import EMPTY_RAW, VOID_RAW
 from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
-from ntop.field.warp import identity_warp, occupied, octant_radius_m
+from ntop.field.warp import identity_warp, occupied
 from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import cropped, resized
 from ntop.report.inputs import Dataset
@@ -78,10 +78,8 @@ def ball(center_world: Float[np.ndarray, " 3"]) -> PosedAvatar:
     values[64:, 0] = np.clip(RAW_PER_M * depth, *RAW_LIMITS)
     grid = CanonicalGrid(values, bricks, positions, np.zeros(3), VOXEL_M)
     warp = identity_warp(low, center_world + reach, cell_m=CELL_M)
-    occupancy = occupied_cells(
-        grid, raw_threshold=SETTINGS.raw_threshold, margin_m=octant_radius_m(CELL_M)
-    )
-    warp = replace(warp, tables=occupied(warp.tables, occupancy))
+    dense = dense_voxels(grid, raw_threshold=EMPTY_RAW)
+    warp = replace(warp, tables=occupied(warp.tables, dense, extent=1.0))
     light = np.zeros((9, 3), np.float32)
     light[0] = 1
     labels = PartLabels(np.ones((1, 1, 1), np.uint8), np.zeros(3), 1.0)

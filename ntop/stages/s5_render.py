@@ -25,7 +25,7 @@ from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
 from ntop.field.devices import kernel_words
-from ntop.field.rendering import Rendering, pose_avatar, render_view
+from ntop.field.rendering import PRESETS, Rendering, pose_avatar, render_view
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
@@ -221,10 +221,11 @@ def render_set(
     body = body_columns(studio.model, pose)
     pelvis = torch.tensor(body["joints3d_world_m"][:3], dtype=torch.float64)
     cameras = top_view_cameras(studio.rig, pelvis, paper_compat=studio.config.paper_compat)
-    posed = pose_avatar(studio.avatar, studio.model, pose)
+    settings = PRESETS[studio.config.quality]
+    posed = pose_avatar(studio.avatar, studio.model, pose, settings=settings)
     hashes: dict[str, Future[str]] = {}
     for view, camera in cameras.items():
-        rendering = render_view(posed, camera)
+        rendering = render_view(posed, camera, settings=settings)
         paths = {column: folder / path for column, path in image_paths(key, view).items()}
         hashes[view] = encoder.submit(write_view, rendering, paths)
     return [

@@ -10,9 +10,11 @@ import torch
 from ntop.field import twin
 from ntop.field.kernels.adjoint import train_rays
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
+from ntop.field.kernels.tables import EMPTY_DENSITY
 from tests.field.conftest import ball_grid, random_rays
 
 STEP_M = 0.01
+TWIN_STEP_M = 0.0005
 RAYS = 300
 
 
@@ -22,40 +24,50 @@ def light_of(seed=2):
     return light
 
 
-def rendered(grid, warp, origins, directions, *, offsets, light, stop=0.0):
+def rendered(grid, warp, origins, directions, *, offsets, light, stop=0.0, step_m=STEP_M):
     count = len(directions)
     colours, opacity = np.empty((count, 3), np.float32), np.empty(count, np.float32)
     depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
     evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
     render_rays(
         grid.tables(), warp.tables, light, np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0,
-        np.zeros(1, np.int64), origins, directions, offsets, STEP_M, stop, 0.0, colours, opacity,
-        depth, parts, evaluations,
+        np.zeros(1, np.int64), origins, directions, offsets, step_m, stop, 0.0, True, colours,
+        opacity, depth, parts, evaluations,
     )  # fmt: skip
     return colours, opacity, depth, evaluations
 
 
-def twin_field(grid, values, warp, origins, directions, offsets):
+def twin_field(grid, values, warp, origins, directions, offsets, *, step_m=STEP_M):
     samples = twin.place_samples(
         warp.tables, torch.from_numpy(origins), torch.from_numpy(directions),
-        torch.from_numpy(offsets), step_m=STEP_M, count=200,
+        torch.from_numpy(offsets), step_m=step_m, count=round(2 / step_m),
     )  # fmt: skip
     return twin.field_at(grid.tables(), values, warp.tables, samples)
 
 
-def test_rendered_rays_equal_the_twin(ball, full_warp):
-    origins, directions = random_rays(RAYS)
-    offsets = np.random.default_rng(0).random(RAYS)
+def test_rendered_rays_converge_to_the_twin(full_warp):
+    ball, count = ball_grid(dtype=np.float64), 40
+    origins, directions = random_rays(count)
+    offsets = np.random.default_rng(0).random(count)
     light = light_of()
-    colours, opacity, _, _ = rendered(
-        ball, full_warp, origins, directions, offsets=offsets, light=light
+    raw, normals = twin_field(
+        ball, torch.from_numpy(ball.values), full_warp, origins, directions, np.full(count, 0.5),
+        step_m=TWIN_STEP_M,
+    )  # fmt: skip
+    expected = twin.seen_rays(
+        raw, normals, torch.from_numpy(light), step_m=TWIN_STEP_M, empty_density=EMPTY_DENSITY
     )
-    values = torch.from_numpy(ball.values.astype(np.float64))
-    raw, normals = twin_field(ball, values, full_warp, origins, directions, offsets)
-    expected = twin.seen_rays(raw, normals, torch.from_numpy(light), step_m=STEP_M)
-    assert (opacity > 0.5).mean() > 0.3
-    assert np.abs(opacity - expected.opacity.numpy()).max() < 2e-5
-    assert np.abs(colours - expected.rgb.numpy()).max() < 2e-5
+    errors = []
+    for step_m in (0.008, 0.004, 0.002):
+        colours, opacity, _, _ = rendered(
+            ball, full_warp, origins, directions, offsets=offsets, light=light, step_m=step_m
+        )
+        opacity_error = np.abs(opacity - expected.opacity.numpy()).max()
+        errors.append(max(opacity_error, np.abs(colours - expected.rgb.numpy()).max()))
+    assert (expected.opacity > 0.5).float().mean() > 0.3
+    print(errors)
+    assert errors[-1] < 2e-4
+    assert errors[0] > 3 * errors[1] > 9 * errors[2]  # at least second order
 
 
 def test_gradients_equal_autograd_of_the_twin(full_warp):

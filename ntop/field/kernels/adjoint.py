@@ -11,12 +11,14 @@ import math
 import numba
 import numpy as np
 
-from ntop.field.kernels import kernel
-from ntop.field.kernels.march import densest_sheet
+from ntop.field.kernels import device, kernel
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
+    VOID_RAW,
+    canonical_point,
+    grid_corners,
     interpolate,
-    next_occupied,
+    next_sample,
     shade,
     sigmoid,
     softplus,
@@ -27,6 +29,23 @@ from ntop.field.kernels.tables import (
 MAX_SAMPLES = 512  # occupied samples kept per ray; at 4 mm that is 2 m of solid body
 ROBUST_WIDTH = 0.1  # colour errors beyond this count linearly (Charbonnier)
 MIN_SHADE = 0.02  # as in `shade`
+
+
+@device
+def densest_sheet(grid, warp, cell, fx, fy, fz, rows, weights):
+    """Raw density of a sample and the sheet it comes from: the denser of its two.
+
+    `rows` and `weights` (2, 8) hold each sheet's corners afterwards. Sheet -1: nothing here.
+    """
+    best, chosen = VOID_RAW, -1
+    for sheet in range(2):
+        if warp.sheets[cell, sheet, 0] >= 0:
+            x, y, z = canonical_point(warp, cell, sheet, fx, fy, fz)
+            if grid_corners(grid, x, y, z, rows[sheet], weights[sheet]):
+                raw = interpolate(grid, 0, rows[sheet], weights[sheet])
+                if raw > best:
+                    best, chosen = raw, sheet
+    return best, chosen
 
 
 @kernel
@@ -55,8 +74,6 @@ def train_rays(
     blocks, count = gradients.shape[0], directions.shape[0]
     for block in numba.prange(blocks):
         real = grid.values.dtype
-        ray = np.empty(12, np.float64)
-        state = np.empty(4, np.float64)
         rows = np.empty((2, 8), np.int64)
         weights = np.empty((2, 8), real)
         kept_rows = np.empty((MAX_SAMPLES, 8), np.int64)
@@ -64,15 +81,18 @@ def train_rays(
         kept = np.empty((MAX_SAMPLES, 12), np.float64)
         # columns: d tau / d raw, tau, weight, T after, albedo (3), normal (3), -, -
         for r in range(block * count // blocks, (block + 1) * count // blocks):
-            start_ray(warp, poses[r], origins[r], directions[r], step, offsets[r], ray, state)
+            ray, near, far = start_ray(warp, poses[r], origins[r], directions[r])
+            sample = max(0, int(math.ceil(near / step - offsets[r])))
             samples = 0
             thickness, transmittance = 0.0, 1.0
             red = green = blue = 0.0
             while transmittance >= stop and samples < MAX_SAMPLES:
-                cell = next_occupied(warp, poses[r], ray, state)
+                sample, cell, fx, fy, fz = next_sample(
+                    warp, poses[r], ray, far, step, offsets[r], sample
+                )
                 if cell < 0:
                     break
-                raw, sheet = densest_sheet(grid, warp, cell, state, rows, weights)
+                raw, sheet = densest_sheet(grid, warp, cell, fx, fy, fz, rows, weights)
                 if sheet >= 0:
                     tau = DENSITY_SCALE * softplus(raw) * step
                     weight = transmittance * -math.expm1(-tau)
@@ -84,7 +104,7 @@ def train_rays(
                         kept_weights[samples, c] = weights[sheet, c]
                     keep[0] = DENSITY_SCALE * sigmoid(raw) * step
                     keep[1], keep[2], keep[3] = tau, weight, transmittance
-                    nx, ny, nz = surface_normal(warp, cell, sheet, state[1], state[2], state[3])
+                    nx, ny, nz = surface_normal(warp, cell, sheet, fx, fy, fz)
                     keep[7], keep[8], keep[9] = nx, ny, nz
                     for channel in range(3):
                         keep[4 + channel] = sigmoid(
@@ -94,7 +114,7 @@ def train_rays(
                     green += weight * keep[5] * shade(light, 1, nx, ny, nz)
                     blue += weight * keep[6] * shade(light, 2, nx, ny, nz)
                     samples += 1
-                state[0] += 1
+                sample += 1
 
             opacity = 1 - transmittance
             matte, camera = mattes[r], cameras[r]

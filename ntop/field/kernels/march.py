@@ -1,54 +1,119 @@
 """March rays through a posed avatar and composite: what every rendered pixel is made of.
 
-Notation: sample i covers [t_i - step/2, t_i + step/2], optical depth tau_i = density_i * step,
-S_i = tau_0 + ... + tau_(i-1) (exclusive), transmittance T_i = exp(-S_i), weight
-w_i = T_i * (1 - exp(-tau_i)). Twin: `ntop.field.twin.composite`.
+Inside an octant of the warp grid a ray is a straight line in canonical space, and between two faces
+of canonical voxels raw density is smooth along it. A ray is therefore cut into *pieces*, at the
+faces of octants and voxels and at the nodes t = (k + offset) * step of a lattice that bounds their
+lengths. No kink of the field lies inside a piece, so two Gauss points give its optical depth tau.
+With S the depth before it and T = exp(-S), its weight is w = T * (1 - exp(-tau)), and its colour
+that of the mean place at which it takes its light. Specification: `ntop.field.twin`, the same
+integral by brute force.
+
+Everything up to `march_ray` is scalar code over arrays and tuples without memory of its own, so
+that every compiler of numba can take it.
 """
 
 import math
 
 import numba
-import numpy as np
 
 from ntop.field.kernels import device, kernel
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
-    VOID_RAW,
+    EMPTY_DENSITY,
+    EMPTY_RAW,
+    HUGE,
+    TINY_M,
     canonical_point,
-    grid_corners,
-    interpolate,
-    next_occupied,
+    next_octant,
+    raw_colour,
+    raw_density,
     shade,
     sigmoid,
     softplus,
     start_ray,
     surface_normal,
+    voxel_corners,
+    voxel_of,
 )
 
 RAYS_PER_CHUNK = 128
 MEDIAN_DEPTH = math.log(2.0)  # optical depth at which half of the light is gone
+GAUSS_POINT = 1 / math.sqrt(3)  # of two, on [-1, 1]
+NO_SHEET = -1e6  # a place, in voxels
+THIN = 1e-3  # optical depth below which a series replaces a difference that cancels
+ON_FACE = 1e-6  # how near a face or node counts as on it, in voxels or steps
 
 
 @device
-def densest_sheet(grid, warp, cell, state, rows, weights):
-    """Raw density of a sample and the sheet it comes from: the denser of its two.
-
-    `rows` and `weights` (2, 8) hold each sheet's corners afterwards. Sheet -1: nothing here.
-    """
-    best, chosen = VOID_RAW, -1
-    for sheet in range(2):
-        if warp.sheets[cell, sheet, 0] >= 0:
-            x, y, z = canonical_point(warp, cell, sheet, state[1], state[2], state[3])
-            if grid_corners(grid, x, y, z, rows[sheet], weights[sheet]):
-                raw = interpolate(grid, 0, rows[sheet], weights[sheet])
-                if raw > best:
-                    best, chosen = raw, sheet
-    return best, chosen
+def sheet_place(grid, warp, cell, sheet, fx, fy, fz):
+    """Canonical place (3, voxels) of a point of a cell; NO_SHEET where it has no such sheet."""
+    if warp.sheets[cell, sheet, 0] < 0:
+        return NO_SHEET, NO_SHEET, NO_SHEET
+    x, y, z = canonical_point(warp, cell, sheet, fx, fy, fz)
+    return (
+        (x - grid.origin[0]) * grid.inverse_voxel,
+        (y - grid.origin[1]) * grid.inverse_voxel,
+        (z - grid.origin[2]) * grid.inverse_voxel,
+    )
 
 
 @device
-def part_at(labels, labels_origin, inverse_spacing, x, y, z):
-    """Part value (label + 1) of the label node nearest to a canonical point."""
+def path_between(start, end, length):
+    """A straight path: place on entry (3, voxels) and voxels per metre (3)."""
+    return (
+        start[0], start[1], start[2],
+        (end[0] - start[0]) / length, (end[1] - start[1]) / length, (end[2] - start[2]) / length,
+    )  # fmt: skip
+
+
+@device
+def along(path, s):
+    """The place (3, voxels) after `s` metres of a path."""
+    return path[0] + s * path[3], path[1] + s * path[4], path[2] + s * path[5]
+
+
+@device
+def to_next_face(place, velocity):
+    """Metres until a coordinate in voxels crosses a face."""
+    if velocity > 0:
+        return (math.floor(place + ON_FACE) + 1 - place) / velocity
+    if velocity < 0:
+        return (math.ceil(place - ON_FACE) - 1 - place) / velocity
+    return HUGE
+
+
+@device
+def to_next_voxel(path, s):
+    """Metres until a path that has gone `s` leaves its voxel."""
+    x, y, z = along(path, s)
+    return min(to_next_face(x, path[3]), min(to_next_face(y, path[4]), to_next_face(z, path[5])))
+
+
+@device
+def mean_place(tau):
+    """Where a homogeneous piece of optical depth tau takes its light on average, as a share."""
+    if tau < THIN:
+        return 0.5 - tau / 12
+    return 1 / tau - 1 / math.expm1(tau)
+
+
+@device
+def denser_place(grid, first, second, two, s):
+    """Which of a ray's one or two sheets is the denser after `s` metres, and the place there."""
+    x, y, z = along(first, s)
+    if two:
+        other_x, other_y, other_z = along(second, s)
+        if raw_density(grid, other_x, other_y, other_z) > raw_density(grid, x, y, z):
+            return 1, other_x, other_y, other_z
+    return 0, x, y, z
+
+
+@device
+def part_at(grid, labels, labels_origin, inverse_spacing, x, y, z):
+    """Part value (label + 1) of the label node nearest to a canonical place (voxels)."""
+    x = grid.origin[0] + x / grid.inverse_voxel
+    y = grid.origin[1] + y / grid.inverse_voxel
+    z = grid.origin[2] + z / grid.inverse_voxel
     i = int((x - labels_origin[0]) * inverse_spacing + 0.5)
     j = int((y - labels_origin[1]) * inverse_spacing + 0.5)
     k = int((z - labels_origin[2]) * inverse_spacing + 0.5)
@@ -58,10 +123,123 @@ def part_at(labels, labels_origin, inverse_spacing, x, y, z):
     return labels[i, j, k]
 
 
+@device
+def march_ray(
+    grid, warp, light, labels, labels_origin, inverse_spacing, pose, origin, direction, offset,
+    step, stop, colour_floor, skipping,
+):  # fmt: skip
+    """One ray; arguments as of `render_rays`.
+
+    Returns red, green, blue (premultiplied), opacity, depth, part and the number of voxels that
+    were looked up.
+    """
+    ray, t, far = start_ray(warp, pose, origin, direction)
+    red = green = blue = 0.0
+    thickness, transmittance = 0.0, 1.0
+    depth, part = 0.0, 0
+    looked_up = 0
+    last_cell, last_t = -1, -1.0
+    end_a = end_b = (NO_SHEET, NO_SHEET, NO_SHEET)
+    while transmittance >= stop:
+        t, leave, cell, fx, fy, fz = next_octant(warp, pose, ray, t, far, skipping)
+        if cell == -1:
+            break
+        if cell == -2:
+            looked_up += 1
+            t = leave
+            continue
+        length = leave - t
+        if cell == last_cell and t == last_t:
+            start_a, start_b = end_a, end_b
+        else:
+            start_a = sheet_place(grid, warp, cell, 0, fx, fy, fz)
+            start_b = sheet_place(grid, warp, cell, 1, fx, fy, fz)
+        gx, gy, gz = fx + length * ray[3], fy + length * ray[4], fz + length * ray[5]
+        end_a = sheet_place(grid, warp, cell, 0, gx, gy, gz)
+        end_b = sheet_place(grid, warp, cell, 1, gx, gy, gz)
+        last_cell, last_t = cell, leave
+        path_a = path_between(start_a, end_a, length)
+        path_b = path_between(start_b, end_b, length)
+        two = start_b[0] > NO_SHEET
+        s = 0.0
+        while s < length and transmittance >= stop:
+            # to the next face of a voxel
+            border = to_next_voxel(path_a, s)
+            if two:
+                border = min(border, to_next_voxel(path_b, s))
+            border = min(s + max(border, TINY_M), length)
+            x, y, z = along(path_a, 0.5 * (s + border))
+            i, j, k = voxel_of(grid, x, y, z)
+            c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(grid, i, j, k)
+            looked_up += 1
+            highest = max(max(max(c0, c1), max(c2, c3)), max(max(c4, c5), max(c6, c7)))
+            if highest <= EMPTY_RAW and not two:
+                s = border
+                continue
+            # raw density as a polynomial of the place in the voxel
+            c7 = c7 - c6 - c5 + c4 - c3 + c2 + c1 - c0
+            c6 = c6 - c4 - c2 + c0
+            c5 = c5 - c4 - c1 + c0
+            c3 = c3 - c2 - c1 + c0
+            c4, c2, c1 = c4 - c0, c2 - c0, c1 - c0
+            while s < border and transmittance >= stop:
+                # to the next node of the lattice
+                node = (math.floor((t + s) / step - offset + ON_FACE) + 1 + offset) * step - t
+                end = max(min(node, border), s + TINY_M)
+                half = 0.5 * (end - s)
+                density = slope = 0.0
+                for side in (-1, 1):
+                    q = s + half * (1 + GAUSS_POINT * side)
+                    x, y, z = along(path_a, q)
+                    x, y, z = x - i, y - j, z - k
+                    raw = c0 + x * (c4 + y * (c6 + z * c7) + z * c5) + y * (c2 + z * c3) + z * c1
+                    if two:
+                        x, y, z = along(path_b, q)
+                        raw = max(raw, raw_density(grid, x, y, z))
+                        looked_up += 1
+                    if raw > EMPTY_RAW:
+                        found = softplus(raw) - EMPTY_DENSITY
+                        density += found
+                        slope += found * side
+                if density > 0:
+                    tau = DENSITY_SCALE * density * half
+                    if thickness < MEDIAN_DEPTH <= thickness + tau:
+                        q = s + (end - s) * (MEDIAN_DEPTH - thickness) / tau
+                        _, x, y, z = denser_place(grid, path_a, path_b, two, q)
+                        part = part_at(grid, labels, labels_origin, inverse_spacing, x, y, z)
+                        depth = t + q
+                    # the halves of the piece, with a density that rises or falls evenly
+                    first = tau * (0.5 - 0.25 / GAUSS_POINT * slope / density)
+                    first = min(max(first, 0.0), tau)
+                    second = tau - first
+                    weight_first = transmittance * -math.expm1(-first)
+                    weight_second = (transmittance - weight_first) * -math.expm1(-second)
+                    weight = weight_first + weight_second
+                    if weight >= colour_floor:
+                        q = s + half * (
+                            weight_first * mean_place(first)
+                            + weight_second * (1 + mean_place(second))
+                        ) / weight  # fmt: skip
+                        sheet, x, y, z = denser_place(grid, path_a, path_b, two, q)
+                        raw_red, raw_green, raw_blue = raw_colour(grid, x, y, z)
+                        nx, ny, nz = surface_normal(
+                            warp, cell, sheet, fx + q * ray[3], fy + q * ray[4], fz + q * ray[5]
+                        )
+                        red += weight * sigmoid(raw_red) * shade(light, 0, nx, ny, nz)
+                        green += weight * sigmoid(raw_green) * shade(light, 1, nx, ny, nz)
+                        blue += weight * sigmoid(raw_blue) * shade(light, 2, nx, ny, nz)
+                    thickness += tau
+                    transmittance = math.exp(-thickness)
+                s = end
+            s = max(s, border)
+        t = leave
+    return red, green, blue, -math.expm1(-thickness), depth, part, looked_up
+
+
 @kernel
 def render_rays(
     grid, warp, light, labels, labels_origin, inverse_spacing, poses, origins, directions, offsets,
-    step, stop, colour_floor, colours, opacity, depth, parts, evaluations,
+    step, stop, colour_floor, skipping, colours, opacity, depth, parts, evaluations,
 ):  # fmt: skip
     """Colour, opacity, median depth and part of each ray.
 
@@ -70,74 +248,24 @@ def render_rays(
         labels_origin, inverse_spacing: Of that grid (metres, 1/m).
         poses: (1 or rays,) which pose of `warp`.
         origins: (1 or rays, 3) relative to the warp grid's origin. directions: (rays, 3) unit.
-        offsets: (rays,) in steps; 0.5 puts samples at interval midpoints from the camera.
-        step: metres. stop: transmittance below which a ray ends.
-        colour_floor: weight below which a sample's colour is not looked up.
+        offsets: (rays,) of the lattice that bounds pieces, in steps. step: of it, metres.
+        stop: transmittance below which a ray ends.
+        colour_floor: weight below which a piece's colour is not looked up.
+        skipping: whether rays jump over octants that are not occupied.
         colours, opacity, depth, parts: Outputs; colours are premultiplied, depth is metres along
-            the ray where half of the light is gone (where less than half is lost: the sample of
-            largest weight), 0 where there is nothing.
-        evaluations: (chunks,) density look-ups, for the cost reports.
+            the ray where half of the light is gone, 0 where less is lost.
+        evaluations: (chunks,) voxels looked up, for the cost reports.
     """
     count = directions.shape[0]
     for chunk in numba.prange((count + RAYS_PER_CHUNK - 1) // RAYS_PER_CHUNK):
-        ray = np.empty(12, np.float64)
-        state = np.empty(4, np.float64)
-        rows = np.empty((2, 8), np.int64)
-        weights = np.empty((2, 8), grid.values.dtype)
         looked_up = 0
         for r in range(chunk * RAYS_PER_CHUNK, min(count, (chunk + 1) * RAYS_PER_CHUNK)):
-            origin = origins[r if origins.shape[0] > 1 else 0]
-            pose = poses[r if poses.shape[0] > 1 else 0]
-            start_ray(warp, pose, origin, directions[r], step, offsets[r], ray, state)
-            red = green = blue = 0.0
-            thickness, transmittance = 0.0, 1.0
-            heaviest, median_t = 0.0, 0.0
-            median_cell, median_sheet = -1, 0
-            mx = my = mz = 0.0
-            while transmittance >= stop:
-                cell = next_occupied(warp, pose, ray, state)
-                if cell < 0:
-                    break
-                looked_up += 1
-                raw, sheet = densest_sheet(grid, warp, cell, state, rows, weights)
-                if sheet >= 0:
-                    tau = DENSITY_SCALE * softplus(raw) * step
-                    weight = transmittance * -math.expm1(-tau)
-                    t = (state[0] + offsets[r]) * step
-                    crosses = thickness < MEDIAN_DEPTH <= thickness + tau
-                    if crosses or (weight > heaviest and thickness < MEDIAN_DEPTH):
-                        median_t = t
-                        if crosses:
-                            median_t = t + step * ((MEDIAN_DEPTH - thickness) / tau - 0.5)
-                        heaviest = weight
-                        median_cell, median_sheet = cell, sheet
-                        mx, my, mz = state[1], state[2], state[3]
-                    if weight >= colour_floor:
-                        nx, ny, nz = surface_normal(warp, cell, sheet, state[1], state[2], state[3])
-                        corner_rows, corner_weights = rows[sheet], weights[sheet]
-                        red += (
-                            weight
-                            * shade(light, 0, nx, ny, nz)
-                            * sigmoid(interpolate(grid, 1, corner_rows, corner_weights))
-                        )
-                        green += (
-                            weight
-                            * shade(light, 1, nx, ny, nz)
-                            * sigmoid(interpolate(grid, 2, corner_rows, corner_weights))
-                        )
-                        blue += (
-                            weight
-                            * shade(light, 2, nx, ny, nz)
-                            * sigmoid(interpolate(grid, 3, corner_rows, corner_weights))
-                        )
-                    thickness += tau
-                    transmittance = math.exp(-thickness)
-                state[0] += 1
+            red, green, blue, opaque, median, part, number = march_ray(
+                grid, warp, light, labels, labels_origin, inverse_spacing,
+                poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
+                directions[r], offsets[r], step, stop, colour_floor, skipping,
+            )  # fmt: skip
             colours[r, 0], colours[r, 1], colours[r, 2] = red, green, blue
-            opacity[r] = -math.expm1(-thickness)
-            depth[r] = median_t
-            parts[r] = 0
-            if median_cell >= 0:
-                x, y, z = canonical_point(warp, median_cell, median_sheet, mx, my, mz)
-                parts[r] = part_at(labels, labels_origin, inverse_spacing, x, y, z)
+            opacity[r], depth[r], parts[r] = opaque, median, part
+            looked_up += number
         evaluations[chunk] = looked_up

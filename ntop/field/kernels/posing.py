@@ -349,29 +349,69 @@ def cell_sheets(
         extra_count[number] = used
 
 
-@kernel
-def octant_occupancy(warp, canonical_occupancy, origin, inverse_spacing, occupancy):
-    """Bit c of a cell: does the canonical occupancy allow density at the centre of octant c?
+@device
+def image_of_box(warp, cell, sheet, centre, half, low, high):
+    """Bounds (3 each) of the canonical image of a box in a cell.
 
-    `canonical_occupancy` must be dilated by the half diagonal of an octant.
+    `centre` (3) and `half` are in cells. A trilinear map sends a box into the hull of the images of
+    its corners, so nothing of the image lies outside.
+    """
+    low[:], high[:] = np.inf, -np.inf
+    for corner in range(8 if half > 0 else 1):
+        x, y, z = canonical_point(
+            warp, cell, sheet,
+            centre[0] + (half if corner & 4 else -half),
+            centre[1] + (half if corner & 2 else -half),
+            centre[2] + (half if corner & 1 else -half),
+        )  # fmt: skip
+        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
+        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
+
+
+@device
+def any_marked(marked, origin, inverse_spacing, low, high):
+    """Is a cell of the grid `marked` (origin in metres) set that the box low..high touches?"""
+    i0 = max(int(math.floor((low[0] - origin[0]) * inverse_spacing)), 0)
+    j0 = max(int(math.floor((low[1] - origin[1]) * inverse_spacing)), 0)
+    k0 = max(int(math.floor((low[2] - origin[2]) * inverse_spacing)), 0)
+    i1 = min(int(math.floor((high[0] - origin[0]) * inverse_spacing)), marked.shape[0] - 1)
+    j1 = min(int(math.floor((high[1] - origin[1]) * inverse_spacing)), marked.shape[1] - 1)
+    k1 = min(int(math.floor((high[2] - origin[2]) * inverse_spacing)), marked.shape[2] - 1)
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            for k in range(k0, k1 + 1):
+                if marked[i, j, k]:
+                    return True
+    return False
+
+
+@kernel
+def octant_occupancy(warp, canonical_occupancy, origin, inverse_spacing, extent, occupancy):
+    """Bit c of a cell: does the canonical occupancy allow density in octant c?
+
+    Args:
+        extent: how much of each octant is looked at: 1 is all of it, so that no density is missed;
+            0 is its centre alone, for an occupancy dilated by the half diagonal of an octant.
+        occupancy: (cells,) uint8 output.
     """
     for cell in numba.prange(occupancy.shape[0]):
+        centre, low, high = np.empty(3), np.empty(3), np.empty(3)
         bits = 0
-        for octant in range(8):
-            fx = 0.75 if octant & 4 else 0.25
-            fy = 0.75 if octant & 2 else 0.25
-            fz = 0.75 if octant & 1 else 0.25
-            for sheet in range(2):
-                if warp.sheets[cell, sheet, 0] >= 0:
-                    x, y, z = canonical_point(warp, cell, sheet, fx, fy, fz)
-                    i = int(math.floor((x - origin[0]) * inverse_spacing))
-                    j = int(math.floor((y - origin[1]) * inverse_spacing))
-                    k = int(math.floor((z - origin[2]) * inverse_spacing))
-                    if (
-                        0 <= i < canonical_occupancy.shape[0]
-                        and 0 <= j < canonical_occupancy.shape[1]
-                        and 0 <= k < canonical_occupancy.shape[2]
-                        and canonical_occupancy[i, j, k]
-                    ):
-                        bits |= 1 << octant
+        for sheet in range(2):
+            if warp.sheets[cell, sheet, 0] < 0:
+                continue
+            if extent > 0:
+                centre[:] = 0.5
+                image_of_box(warp, cell, sheet, centre, 0.5, low, high)
+                if not any_marked(canonical_occupancy, origin, inverse_spacing, low, high):
+                    continue
+            for octant in range(8):
+                if (bits >> octant) & 1:
+                    continue
+                centre[0] = 0.75 if octant & 4 else 0.25
+                centre[1] = 0.75 if octant & 2 else 0.25
+                centre[2] = 0.75 if octant & 1 else 0.25
+                image_of_box(warp, cell, sheet, centre, 0.25 * extent, low, high)
+                if any_marked(canonical_occupancy, origin, inverse_spacing, low, high):
+                    bits |= 1 << octant
         occupancy[cell] = bits

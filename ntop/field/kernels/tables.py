@@ -8,8 +8,9 @@ Warp tables
     Per pose a grid of cells around the posed body. `cells` gives a cell's number or -1; a cell has
     one or two *sheets* of 8 nodes (two where two body parts are near each other), and a node holds
     [canonical position (metres), world normal of the nearest surface]. Bit c of `occupancy` says
-    whether octant c of the cell may hold density; `blocks` says so for 4 x 4 x 4 cells. Corner and
-    octant number c counts x in bit 2, y in bit 1, z in bit 0.
+    whether octant c of the cell may hold density; `blocks` says of 4 x 4 x 4 cells how many blocks
+    away the nearest block with such an octant is. Corner and octant number c counts x in bit 2, y
+    in bit 1, z in bit 0.
 """
 
 import math
@@ -22,7 +23,10 @@ from ntop.field.kernels import device
 
 VOID_RAW = -12.0
 DENSITY_SCALE = 400.0  # 1/m per unit of softplus(raw): raw 8 is opaque within a millimetre
+EMPTY_RAW = -4.0  # space of no more raw density than this is empty, by definition
+EMPTY_DENSITY = math.log1p(math.exp(EMPTY_RAW))  # per DENSITY_SCALE; taken off all densities
 HUGE = 1e30
+TINY_M = 1e-6  # what a ray steps over where rounding would keep it in place
 
 
 class GridTables(NamedTuple):
@@ -129,6 +133,80 @@ def interpolate(grid, channel, rows, weights):
 
 
 @device
+def voxel_of(grid, x, y, z):
+    """Index (3) of a canonical place in voxels; -1 first where it is outside the grid."""
+    if not (x >= 0 and y >= 0 and z >= 0):  # also refuses NaN
+        return -1, 0, 0
+    i, j, k = int(x), int(y), int(z)
+    shape = grid.bricks.shape
+    if i + 1 >= 4 * shape[0] or j + 1 >= 4 * shape[1] or k + 1 >= 4 * shape[2]:
+        return -1, 0, 0
+    return i, j, k
+
+
+@device
+def row_of(grid, i, j, k):
+    """Row of a node's values."""
+    return grid.bricks[i >> 2, j >> 2, k >> 2] * 64 + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))
+
+
+@device
+def voxel_corners(grid, i, j, k):
+    """Raw density of the 8 nodes of a voxel; the void's if i < 0."""
+    if i < 0:
+        return VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW
+    values = grid.values
+    if (i & 3) < 3 and (j & 3) < 3 and (k & 3) < 3:
+        row = row_of(grid, i, j, k)
+        return (
+            values[row, 0], values[row + 1, 0], values[row + 4, 0], values[row + 5, 0],
+            values[row + 16, 0], values[row + 17, 0], values[row + 20, 0], values[row + 21, 0],
+        )  # fmt: skip
+    return (
+        values[row_of(grid, i, j, k), 0],
+        values[row_of(grid, i, j, k + 1), 0],
+        values[row_of(grid, i, j + 1, k), 0],
+        values[row_of(grid, i, j + 1, k + 1), 0],
+        values[row_of(grid, i + 1, j, k), 0],
+        values[row_of(grid, i + 1, j, k + 1), 0],
+        values[row_of(grid, i + 1, j + 1, k), 0],
+        values[row_of(grid, i + 1, j + 1, k + 1), 0],
+    )
+
+
+@device
+def raw_density(grid, x, y, z):
+    """Raw density at a canonical place in voxels; the void's outside the grid."""
+    i, j, k = voxel_of(grid, x, y, z)
+    if i < 0:
+        return VOID_RAW
+    fx, fy, fz = x - i, y - j, z - k
+    total = 0.0
+    for c in range(8):
+        row = row_of(grid, i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1))
+        w = (fx if c & 4 else 1 - fx) * (fy if c & 2 else 1 - fy) * (fz if c & 1 else 1 - fz)
+        total += w * grid.values[row, 0]
+    return total
+
+
+@device
+def raw_colour(grid, x, y, z):
+    """Raw red, green and blue at a canonical place in voxels."""
+    i, j, k = voxel_of(grid, x, y, z)
+    if i < 0:
+        return 0.0, 0.0, 0.0
+    fx, fy, fz = x - i, y - j, z - k
+    red = green = blue = 0.0
+    for c in range(8):
+        row = row_of(grid, i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1))
+        w = (fx if c & 4 else 1 - fx) * (fy if c & 2 else 1 - fy) * (fz if c & 1 else 1 - fz)
+        red += w * grid.values[row, 1]
+        green += w * grid.values[row, 2]
+        blue += w * grid.values[row, 3]
+    return red, green, blue
+
+
+@device
 def shade(light, channel, x, y, z):
     """Light on a surface with unit normal (x, y, z): a quadratic, as second-order harmonics are.
 
@@ -155,75 +233,107 @@ def exit_length(o, inverse_d, low, size):
 
 
 @device
-def next_occupied(warp, pose, ray, state):
-    """Advance a ray to its next sample in an occupied octant; returns its cell, or -1 at the end.
+def start_ray(warp, pose, origin, direction):
+    """A ray in cells, and the lengths (m) between which it is inside the warp grid's box.
 
-    `ray`: origin in cells (3), direction in cells per metre (3), its inverse (3), step (m), offset
-    (steps), far end (m). `state`: sample index k; on return also the fractions in the cell (3).
-    Samples lie at t = (k + offset) * step whatever is skipped, so skipping changes no image.
+    The ray: origin in cells (3), direction in cells per metre (3), its inverse (3). One with a
+    number that is none, or without a direction, is over before it begins.
+    """
+    ox, oy, oz = (
+        origin[0] * warp.inverse_cell,
+        origin[1] * warp.inverse_cell,
+        origin[2] * warp.inverse_cell,
+    )
+    dx, dy, dz = (
+        direction[0] * warp.inverse_cell,
+        direction[1] * warp.inverse_cell,
+        direction[2] * warp.inverse_cell,
+    )
+    ix, iy, iz = safe_inverse(dx), safe_inverse(dy), safe_inverse(dz)
+    near, far = 0.0, HUGE
+    near, far = clip_slab(ox, dx, ix, 1.0 * warp.dims[pose, 0], near, far)
+    near, far = clip_slab(oy, dy, iy, 1.0 * warp.dims[pose, 1], near, far)
+    near, far = clip_slab(oz, dz, iz, 1.0 * warp.dims[pose, 2], near, far)
+    size = abs(ox) + abs(oy) + abs(oz) + abs(dx) + abs(dy) + abs(dz)
+    if not size < HUGE or abs(dx) + abs(dy) + abs(dz) == 0:
+        near, far = 0.0, -1.0
+    return (ox, oy, oz, dx, dy, dz, ix, iy, iz), near, far
+
+
+@device
+def safe_inverse(d):
+    """1 / d, and a huge number instead of infinity: infinity times zero is NaN."""
+    return 1 / d if abs(d) > 1 / HUGE else HUGE
+
+
+@device
+def clip_slab(o, d, inverse, size, near, far):
+    """The part of [near, far] in which o + t d lies in [0, size]; far < near if there is none."""
+    if abs(d) > 1 / HUGE:
+        t0, t1 = -o * inverse, (size - o) * inverse
+        return max(near, min(t0, t1)), min(far, max(t0, t1))
+    if o < 0 or o > size:
+        return near, -1.0
+    return near, far
+
+
+@device
+def next_octant(warp, pose, ray, t, far, skipping):
+    """The first octant at length >= t that may hold density.
+
+    Returns the length at which the ray is in it, the one at which it leaves it, the cell (-1: the
+    ray's end is reached) and the place in the cell (3). Without `skipping`, space without cells
+    is walked through octant by octant too, and those octants are returned as cell -2.
     """
     nx, ny, nz = warp.dims[pose, 0], warp.dims[pose, 1], warp.dims[pose, 2]
     mx, my = (ny + 3) >> 2, (nz + 3) >> 2
-    step, offset, far = ray[9], ray[10], ray[11]
-    k = int(state[0])
-    while True:
-        t = (k + offset) * step
-        if not t < far:
-            return -1
+    while t < far:
         px, py, pz = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
-        i, j, n = int(px), int(py), int(pz)
-        if px < 0 or py < 0 or pz < 0 or i >= nx or j >= ny or n >= nz:
-            k += 1  # rounding at the box's faces
+        i, j, k = int(px), int(py), int(pz)
+        if px < 0 or py < 0 or pz < 0 or i >= nx or j >= ny or k >= nz:
+            t += TINY_M  # rounding at the box's faces
             continue
-        block = warp.blocks[warp.block_offset[pose] + ((i >> 2) * mx + (j >> 2)) * my + (n >> 2)]
-        if block == 0:
-            low_x, low_y, low_z = 1.0 * (i & ~3), 1.0 * (j & ~3), 1.0 * (n & ~3)
-            size = 4.0
+        found = -1
+        fx, fy, fz = px - i, py - j, pz - k
+        away = warp.blocks[warp.block_offset[pose] + ((i >> 2) * mx + (j >> 2)) * my + (k >> 2)]
+        if away > 0 and skipping:
+            # no block is occupied that is less than `away` blocks from this one
+            reach = 4.0 * (away - 1)
+            low_x, low_y, low_z = (i & ~3) - reach, (j & ~3) - reach, (k & ~3) - reach
+            size = 4.0 + 2 * reach
         else:
-            cell = warp.cells[warp.cell_offset[pose] + (i * ny + j) * nz + n]
-            low_x, low_y, low_z = 1.0 * i, 1.0 * j, 1.0 * n
-            size = 1.0
-            if cell >= 0 and warp.occupancy[cell] != 0:
-                fx, fy, fz = px - i, py - j, pz - n
-                octant = 4 * (fx >= 0.5) + 2 * (fy >= 0.5) + 1 * (fz >= 0.5)
-                if (warp.occupancy[cell] >> octant) & 1:
-                    state[0] = k
-                    state[1], state[2], state[3] = fx, fy, fz
-                    return cell
-                low_x += 0.5 * (fx >= 0.5)
-                low_y += 0.5 * (fy >= 0.5)
-                low_z += 0.5 * (fz >= 0.5)
+            cell = warp.cells[warp.cell_offset[pose] + (i * ny + j) * nz + k]
+            if skipping and (cell < 0 or warp.occupancy[cell] == 0):
+                low_x, low_y, low_z = 1.0 * i, 1.0 * j, 1.0 * k
+                size = 1.0
+            else:
+                high_x, high_y, high_z = fx >= 0.5, fy >= 0.5, fz >= 0.5
+                low_x, low_y, low_z = i + 0.5 * high_x, j + 0.5 * high_y, k + 0.5 * high_z
                 size = 0.5
+                if cell < 0:
+                    found = -2
+                elif (warp.occupancy[cell] >> (4 * high_x + 2 * high_y + 1 * high_z)) & 1:
+                    found = cell
         leave = min(
             exit_length(ray[0], ray[6], low_x, size),
             min(exit_length(ray[1], ray[7], low_y, size), exit_length(ray[2], ray[8], low_z, size)),
         )
-        k = max(k + 1, int(math.ceil(leave / step - offset)))
+        leave = max(leave, t + TINY_M)
+        if found != -1:
+            return t, min(leave, far), found, fx, fy, fz
+        t = leave
+    return far, far, -1, 0.0, 0.0, 0.0
 
 
 @device
-def start_ray(warp, pose, origin, direction, step, offset, ray, state):
-    """Fill `ray` and `state` for `next_occupied`: clip the ray to the warp grid's box.
+def next_sample(warp, pose, ray, far, step, offset, k):
+    """The first sample >= k in an occupied octant, and where it is; cell -1 if there is none.
 
-    A ray with a number that is none, or without a direction, is over before it begins.
+    Samples lie at t = (k + offset) * step whatever is skipped, so skipping changes none.
     """
-    near, far, length = 0.0, HUGE, 0.0
-    for a in range(3):
-        o = origin[a] * warp.inverse_cell
-        d = direction[a] * warp.inverse_cell
-        inverse = 1 / d if abs(d) > 1 / HUGE else HUGE
-        ray[a], ray[3 + a], ray[6 + a] = o, d, inverse
-        size = 1.0 * warp.dims[pose, a]
-        length += abs(d)
-        if not (abs(d) < HUGE and abs(o) < HUGE):
-            far = -1.0
-            continue
-        if abs(d) > 1 / HUGE:
-            t0, t1 = -o * inverse, (size - o) * inverse
-            near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
-        elif o < 0 or o > size:
-            far = -1.0
-    if length == 0:
-        far = -1.0
-    ray[9], ray[10], ray[11] = step, offset, far
-    state[0] = max(0.0, math.ceil(near / step - offset))
+    while True:
+        t = max((k + offset) * step, 0.0)
+        t, _, cell, fx, fy, fz = next_octant(warp, pose, ray, t, far, True)
+        if cell < 0 or t == (k + offset) * step:
+            return k, cell, fx, fy, fz
+        k = max(k + 1, int(math.ceil(t / step - offset)))

@@ -90,7 +90,8 @@ class Rendering:
 
     `depth_m` is the ray length at which half of the light is gone, `parts` holds label + 1; both
     are 0 outside the mask (alpha below one half). `window` (left, top, width, height) holds every
-    pixel with alpha > 0; all is zero outside. `evaluations` counts voxels looked up.
+    pixel with alpha > 0; all is zero outside. `evaluations` counts voxels looked
+    up and densities computed.
     """
 
     rgb: Float[np.ndarray, "height width 3"]

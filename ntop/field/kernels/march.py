@@ -130,8 +130,8 @@ def march_ray(
 ):  # fmt: skip
     """One ray; arguments as of `render_rays`.
 
-    Returns red, green, blue (premultiplied), opacity, depth, part and the number of voxels that
-    were looked up.
+    Returns red, green, blue (premultiplied), opacity, depth, part and the number of evaluations:
+    voxels looked up, and densities computed in them.
     """
     ray, t, far = start_ray(warp, pose, origin, direction)
     red = green = blue = 0.0
@@ -196,7 +196,7 @@ def march_ray(
                     if two:
                         x, y, z = along(path_b, q)
                         raw = max(raw, raw_density(grid, x, y, z))
-                        looked_up += 1
+                    looked_up += 1
                     if raw > EMPTY_RAW:
                         found = softplus(raw) - EMPTY_DENSITY
                         density += found
@@ -254,7 +254,7 @@ def render_rays(
         skipping: whether rays jump over octants that are not occupied.
         colours, opacity, depth, parts: Outputs; colours are premultiplied, depth is metres along
             the ray where half of the light is gone, 0 where less is lost.
-        evaluations: (chunks,) voxels looked up, for the cost reports.
+        evaluations: (chunks,) voxels looked up and densities computed, for the cost reports.
     """
     count = directions.shape[0]
     for chunk in numba.prange((count + RAYS_PER_CHUNK - 1) // RAYS_PER_CHUNK):

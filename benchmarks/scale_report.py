@@ -69,7 +69,10 @@ def slope(points: list[tuple[float, float]]) -> float:
 
 def table(campaigns: Campaigns) -> str:
     """One line per phase, one column per campaign; then the files."""
-    names = [f"{c['images']:,} {c['storage']}" + ("" if c["executed"] else " ¹") for c in campaigns]
+    names = [
+        f"{c['images']:,} {c['storage']}" + ("" if c.get("executed", True) else " ¹")
+        for c in campaigns
+    ]
     lines = [
         "Processor seconds (wall seconds) · peak MB, all processes of the command together:",
         "",
@@ -92,7 +95,7 @@ def table(campaigns: Campaigns) -> str:
             for c in campaigns
         ]
         lines.append(f"| {title}: inodes · MB | " + " | ".join(cells) + " | |")
-    if not all(c["executed"] for c in campaigns):
+    if not all(c.get("executed", True) for c in campaigns):
         lines += ["", "¹ Results cloned from an executed shard: see below."]
     return "\n".join(lines)
 
@@ -111,7 +114,7 @@ def plot(campaigns: Campaigns, path: Path) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), dpi=110, sharex=True)
     slopes = exponents(campaigns)
     for axis, key, unit in zip(axes, ("cpu_s", "peak_mb"), ("processor s", "peak MB"), strict=True):
-        for phase, title in PHASES.items():
+        for index, (phase, title) in enumerate(PHASES.items()):
             points = [
                 (c["images"], c[phase][key])
                 for c in campaigns
@@ -120,7 +123,7 @@ def plot(campaigns: Campaigns, path: Path) -> None:
             if points:
                 power = slopes.get(phase, {}).get(key)
                 label = title.strip("`") + (f"  ∝ N^{power:.2f}" if power is not None else "")
-                axis.loglog(*zip(*points, strict=True), marker="o", label=label)
+                axis.loglog(*zip(*points, strict=True), marker="o", color=f"C{index}", label=label)
         axis.set_xlabel("images")
         axis.set_ylabel(unit)
         axis.grid(alpha=0.3)

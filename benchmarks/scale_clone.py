@@ -10,15 +10,17 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ntop.config.files import read_files
 from ntop.config.plan import planned_jobs
-from ntop.config.run import load_files
+from ntop.config.run import BASE, load_run
 from ntop.storage.files import FILES_NAME, record_files
 from ntop.storage.keys import SetKey
 
 
 def clone(folder: Path, executed: Path) -> None:
     """Fill the results of the campaign in `folder` from an `executed` one of the same frames."""
-    run = load_files([], directory=folder)
+    configuration = read_files([folder / BASE]) | {"plan": "plan.json"}
+    run = load_run(configuration, directory=folder)
     original = next(iter(sorted((executed / "results/5_render").glob("*/*/*/*/*"))))
     source, actor, action, _rig, _first = original.relative_to(executed / "results/5_render").parts
     for job in planned_jobs(run):

@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint bench-scale numerics chaos rulegraph
+.PHONY: env demo studio test lint bench bench-scale numerics chaos rulegraph
 
 env: $(VENV)/.ready
 
@@ -58,6 +58,12 @@ TRIALS ?= 60
 SEED ?= 1
 chaos: env
 	$(RUN) python -m tests.chaos --trials $(TRIALS) --seed $(SEED) --jobs $(CORES)
+
+# time against error of the renderer and what skipping saves; reads a finished demo if there is one
+bench: env
+	$(RUN) python -m benchmarks.quadrature
+	$(RUN) python -m benchmarks.skipping
+	$(RUN) python scripts/write_benchmarks_page.py
 
 rulegraph: env
 	$(RUN) scripts/draw_rulegraph.sh

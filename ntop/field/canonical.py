@@ -260,7 +260,7 @@ def occupied_cells(grid: CanonicalGrid, *, raw_threshold: float, margin_m: float
 def dense_voxels(grid: CanonicalGrid, *, raw_threshold: float) -> Occupancy:
     """The voxels in which raw density may exceed a threshold: one of their nodes does."""
     blocks = np.zeros((*grid.bricks.shape, 4, 4, 4), bool)
-    dense = (grid.values[:, 0] > raw_threshold).reshape(-1, 4, 4, 4)
+    dense = ~(grid.values[:, 0] <= raw_threshold).reshape(-1, 4, 4, 4)  # NaN must stay visible
     blocks[tuple(grid.positions[1:].T)] = dense[1:]
     bx, by, bz = grid.bricks.shape
     cells = blocks.transpose(0, 3, 1, 4, 2, 5).reshape(4 * bx, 4 * by, 4 * bz)

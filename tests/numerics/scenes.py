@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, void_values
-from ntop.field.kernels.tables import DENSITY_SCALE
+from ntop.field.kernels.tables import DENSITY_SCALE, EMPTY_DENSITY
 from ntop.field.rendering import PosedAvatar
 from ntop.field.warp import PoseWarp, identity_warp
 
@@ -16,12 +16,12 @@ EXACT = {"stop_transmittance": 0.0, "colour_floor": 0.0, "edge_rays": 1}  # no s
 
 def density_of(raw: np.ndarray) -> np.ndarray:
     """The field's law: density (1/m) of raw values."""
-    return DENSITY_SCALE * np.logaddexp(0.0, raw)
+    return DENSITY_SCALE * np.maximum(np.logaddexp(0.0, raw) - EMPTY_DENSITY, 0)
 
 
 def raw_of(density: np.ndarray) -> np.ndarray:
-    """The law's inverse; vanishing densities become those of the void."""
-    return np.log(np.maximum(np.expm1(density / DENSITY_SCALE), 1e-12))
+    """The law's inverse."""
+    return np.log(np.expm1(density / DENSITY_SCALE + EMPTY_DENSITY))
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def opened(warp: PoseWarp) -> PoseWarp:
     """The same warp with every octant occupied."""
     tables = warp.tables
     full = tables._replace(
-        occupancy=np.full_like(tables.occupancy, 255), blocks=np.ones_like(tables.blocks)
+        occupancy=np.full_like(tables.occupancy, 255), blocks=np.zeros_like(tables.blocks)
     )
     return PoseWarp(full, warp.origin_world, warp.cell_m)
 

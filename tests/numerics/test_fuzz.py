@@ -26,12 +26,13 @@ from ntop.field.avatar import Avatar, load_avatar, save_avatar
 from ntop.field.canonical import (
     CanonicalGrid,
     canonical_body,
+    dense_voxels,
     initial_grid,
     label_grid,
-    occupied_cells,
 )
+from ntop.field.kernels.tables import EMPTY_RAW
 from ntop.field.rendering import PosedAvatar, Rendering, RenderSettings, render_view
-from ntop.field.warp import MAX_NODES, occupied, octant_radius_m, pose_warp
+from ntop.field.warp import MAX_NODES, occupied, pose_warp
 from ntop.geometry.cameras import Camera, Lens
 from ntop.geometry.ideal_fisheyes import Equidistant, Equisolid, Stereographic
 from ntop.geometry.kannala_brandt import KannalaBrandt
@@ -68,8 +69,7 @@ def field(kind: str) -> tuple[CanonicalGrid, np.ndarray, np.ndarray]:
         case "huge colours":
             values[64:, 1:] = 6e4 * noise[:, 1:]
     grid = replace(grid, values=values.astype(np.float32))
-    margin_m = octant_radius_m(CELL_M)
-    return grid, occupied_cells(grid, raw_threshold=-3.0, margin_m=margin_m), label_grid(body)
+    return grid, dense_voxels(grid, raw_threshold=EMPTY_RAW), label_grid(body)
 
 
 FIELDS = ("body", "empty", "solid", "noise", "huge colours")
@@ -83,7 +83,7 @@ def posed(kind: str, pose: BodyPose) -> PosedAvatar:
     warp = pose_warp(body, model, pose, cell_m=CELL_M, reach_m=REACH_M)
     light = np.zeros((9, 3), np.float32)
     light[0] = 1
-    warp = replace(warp, tables=occupied(warp.tables, occupancy))
+    warp = replace(warp, tables=occupied(warp.tables, occupancy, extent=1.0))
     return PosedAvatar(grid=grid, warp=warp, light=light, labels=labels)
 
 

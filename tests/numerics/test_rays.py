@@ -12,7 +12,7 @@ from ntop.annotation.keypoints import project_keypoints
 from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_joints
 from ntop.conventions import VIEWS
-from ntop.field.kernels.tables import next_occupied, start_ray
+from ntop.field.kernels.tables import next_sample, start_ray
 from ntop.field.rendering import RenderSettings, render_view, trace_rays
 from ntop.field.warp import identity_warp
 from ntop.geometry.cameras import Camera
@@ -25,21 +25,23 @@ from ntop.report.blobs import ball
 from tests.numerics.lenses import directions, family
 
 CELLS = np.array([5, 4, 7])  # of the grid under test: a box of 5 x 4 x 7 cells
-RAY = 12  # numbers that `start_ray` keeps
 
 
 @numba.njit
 def walk(warp, origins, rays, step, first, far, counts):
     """First sample and far end of each ray; with `counts`, also how many samples it meets."""
-    ray, state = np.empty(RAY), np.empty(4)
     for r in range(len(rays)):
-        start_ray(warp, 0, origins[r], rays[r], step, 0.5, ray, state)
-        first[r], far[r] = state[0], ray[11]
+        ray, near, far[r] = start_ray(warp, 0, origins[r], rays[r])
+        k = max(0, math.ceil(near / step - 0.5))
+        first[r] = k
         if len(counts) > 0:
             counts[r] = 0
-            while next_occupied(warp, 0, ray, state) >= 0:
+            while True:
+                k, cell, _, _, _ = next_sample(warp, 0, ray, far[r], step, 0.5, k)
+                if cell < 0:
+                    break
                 counts[r] += 1
-                state[0] += 1
+                k += 1
 
 
 def full_grid(cell):
@@ -47,7 +49,7 @@ def full_grid(cell):
     warp = identity_warp(np.zeros(3), (CELLS - 0.5) * cell, cell_m=cell).tables
     assert tuple(warp.dims[0]) == tuple(CELLS)
     return warp._replace(
-        occupancy=np.full_like(warp.occupancy, 255), blocks=np.full_like(warp.blocks, 1)
+        occupancy=np.full_like(warp.occupancy, 255), blocks=np.full_like(warp.blocks, 0)
     )
 
 

@@ -172,8 +172,9 @@ def march_ray(
             i, j, k = voxel_of(grid, x, y, z)
             c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(grid, i, j, k)
             looked_up += 1
-            highest = max(max(max(c0, c1), max(c2, c3)), max(max(c4, c5), max(c6, c7)))
-            if highest <= EMPTY_RAW and not two:
+            empty = c0 <= EMPTY_RAW and c1 <= EMPTY_RAW and c2 <= EMPTY_RAW and c3 <= EMPTY_RAW
+            empty = empty and c4 <= EMPTY_RAW and c5 <= EMPTY_RAW
+            if empty and c6 <= EMPTY_RAW and c7 <= EMPTY_RAW and not two:
                 s = border
                 continue
             # raw density as a polynomial of the place in the voxel
@@ -197,11 +198,11 @@ def march_ray(
                         x, y, z = along(path_b, q)
                         raw = max(raw, raw_density(grid, x, y, z))
                     looked_up += 1
-                    if raw > EMPTY_RAW:
+                    if not raw <= EMPTY_RAW:  # NaN must stay visible
                         found = softplus(raw) - EMPTY_DENSITY
                         density += found
                         slope += found * side
-                if density > 0:
+                if not density <= 0:
                     tau = DENSITY_SCALE * density * half
                     if thickness < MEDIAN_DEPTH <= thickness + tau:
                         q = s + (end - s) * (MEDIAN_DEPTH - thickness) / tau

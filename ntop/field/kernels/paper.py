@@ -8,6 +8,7 @@ import numpy as np
 from ntop.field.kernels import device, kernel
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
+    EMPTY_DENSITY,
     VOID_RAW,
     canonical_point,
     grid_corners,
@@ -79,8 +80,9 @@ def paper_rays(grid, warp, light, origin, directions, near, step, shift, samples
                                 raw, sheet = found, claim
                 if sheet < 0:
                     continue
+                density = max(softplus(raw) - EMPTY_DENSITY, 0.0)
                 delta = step[r] if k < samples - 1 else LAST_DELTA_M
-                alpha = 1 - math.exp(-DENSITY_SCALE * softplus(raw) * delta)
+                alpha = 1 - math.exp(-DENSITY_SCALE * density * delta)
                 x, y, z = surface_normal(warp, cell, sheet, state[1], state[2], state[3])
                 for channel in range(3):
                     albedo = sigmoid(interpolate(grid, 1 + channel, rows[sheet], weights[sheet]))

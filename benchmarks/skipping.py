@@ -1,0 +1,149 @@
+"""What each level of skipping saves, and what it changes: one level switched off at a time.
+
+Usage: python -m benchmarks.skipping [RESULTS] (see benchmarks/quadrature.py). Writes
+benchmarks/results/skipping.json. The last row compares with the paper's sampler: 128 samples on
+every ray that meets the box of the joints.
+"""
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.environment import write_result
+from benchmarks.subjects import RIGS, Subject, subjects
+from ntop.conventions import PIXEL_CENTRE
+from ntop.field.paper_sampler import SAMPLES, box_interval
+from ntop.field.rendering import RenderSettings, body_pixels, render_view
+from ntop.geometry.cameras import Camera
+from ntop.geometry.windows import resized
+
+SIDE_PX = 250
+ON = RenderSettings(edge_rays=1)
+LEVELS = {  # level -> settings without it
+    "pixels": replace(ON, crop=False),
+    "intervals": replace(ON, intervals=False),
+    "cells": replace(ON, cells=False),
+    "behind surfaces": replace(ON, stop_transmittance=0.0),
+    "colour of light weights": replace(ON, colour_floor=0.0),
+    "all": replace(
+        ON, crop=False, intervals=False, cells=False, stop_transmittance=0.0, colour_floor=0.0
+    ),
+}
+EXACT = 1e-6
+BOUNDS = {  # largest change of a value in [0, 1] that the level may cause
+    "pixels": EXACT,
+    "intervals": EXACT,
+    "cells": EXACT,
+    "behind surfaces": EXACT + ON.stop_transmittance,
+    "colour of light weights": None,  # colour_floor times a ray's pieces
+    "all": None,
+}
+
+
+def main(results: Path | None) -> None:
+    """Measure and write."""
+    people = subjects(results)
+    rows = [row for person in people for rig in RIGS for row in measured(person, rig)]
+    values = {
+        "side_px": SIDE_PX,
+        "rows": rows,
+        "paper": [paper(person) for person in people],
+        "views": [away(person) for person in people],
+    }
+    sys.stdout.write(f"{write_result('skipping', values)}\n")
+
+
+def small_views(person: Subject, rig: str) -> list[Camera]:
+    """The nine cameras of a rig with smaller images."""
+    return [
+        replace(camera, lens=resized(camera.lens, width=SIDE_PX, height=SIDE_PX))
+        for camera in person.cameras(rig).values()
+    ]
+
+
+def measured(person: Subject, rig: str) -> list[dict]:
+    """One row per level: work and time without it over those with all, largest pixel change."""
+    cameras = small_views(person, rig)
+    posed = {name: person.posed(settings) for name, settings in {"on": ON, **LEVELS}.items()}
+    full = [render_view(posed["on"], camera, settings=ON) for camera in cameras]
+    rows = []
+    for level, settings in LEVELS.items():
+        evaluations, change, ratios = 0, 0.0, []
+        for camera, whole in zip(cameras, full, strict=True):
+            before = _seconds(posed["on"], camera, ON)
+            started = time.process_time()
+            seen = render_view(posed[level], camera, settings=settings)
+            between = time.process_time() - started
+            ratios.append(2 * between / (before + _seconds(posed["on"], camera, ON)))
+            evaluations += seen.evaluations
+            for layer, other in ((seen.alpha, whole.alpha), (_over(seen), _over(whole))):
+                change = max(change, float(np.abs(layer - other).max()))
+        bound = BOUNDS[level]
+        rows.append(
+            {
+                "subject": person.name,
+                "rig": rig,
+                "level": level,
+                "evaluations": evaluations,
+                "evaluations_with_all": sum(view.evaluations for view in full),
+                "time_ratio": float(np.median(ratios)),
+                "largest_change": change,
+                "bound": bound,
+                "within_bound": None if bound is None else change <= bound,
+            }
+        )
+    sys.stderr.write(f"{person.name} {rig}\n")
+    return rows
+
+
+def paper(person: Subject) -> dict:
+    """Share of the paper's samples that are never computed, mean over both rigs' views."""
+    joints = person.joints_world()
+    posed = person.posed(ON)
+    skipped = []
+    for rig in RIGS:
+        for camera in small_views(person, rig):
+            grid = np.mgrid[:SIDE_PX, :SIDE_PX].reshape(2, -1).T[:, ::-1] + PIXEL_CENTRE
+            directions, valid = camera.rays(torch.from_numpy(grid.copy()))
+            near, far = box_interval(camera.center_world.numpy(), directions[valid].numpy(), joints)
+            theirs = SAMPLES * int((far > near).sum())
+            ours = render_view(posed, camera, settings=ON).evaluations
+            skipped.append(1 - ours / theirs)
+    return {
+        "subject": person.name,
+        "views": len(skipped),
+        "mean": float(np.mean(skipped)),
+        "min": float(np.min(skipped)),
+    }
+
+
+def away(person: Subject) -> dict:
+    """A camera that looks at the sky: no cell is in view, so no ray is marched."""
+    camera = small_views(person, next(iter(RIGS)))[0]
+    flipped = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)) @ camera.rotation
+    up = replace(camera, rotation=flipped)
+    posed = person.posed(ON)
+    return {
+        "subject": person.name,
+        "pixels": int(body_pixels(posed, up).sum()),
+        "evaluations": render_view(posed, up, settings=ON).evaluations,
+    }
+
+
+def _over(view) -> np.ndarray:
+    return view.rgb * view.alpha[..., None]
+
+
+def _seconds(posed, camera: Camera, settings: RenderSettings) -> float:
+    started = time.process_time()
+    render_view(posed, camera, settings=settings)
+    return time.process_time() - started
+
+
+if __name__ == "__main__":
+    given = Path(sys.argv[1]) if sys.argv[1:] else Path("results")
+    main(given if (given / "4_train").is_dir() else None)

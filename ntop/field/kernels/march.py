@@ -216,7 +216,7 @@ def march_ray(
                     weight_first = transmittance * -math.expm1(-first)
                     weight_second = (transmittance - weight_first) * -math.expm1(-second)
                     weight = weight_first + weight_second
-                    if weight >= colour_floor:
+                    if weight > colour_floor:
                         q = s + half * (
                             weight_first * mean_place(first)
                             + weight_second * (1 + mean_place(second))
@@ -251,7 +251,7 @@ def render_rays(
         origins: (1 or rays, 3) relative to the warp grid's origin. directions: (rays, 3) unit.
         offsets: (rays,) of the lattice that bounds pieces, in steps. step: of it, metres.
         stop: transmittance below which a ray ends.
-        colour_floor: weight below which a piece's colour is not looked up.
+        colour_floor: weight up to which a piece's colour is not looked up.
         skipping: whether rays jump over octants that are not occupied.
         colours, opacity, depth, parts: Outputs; colours are premultiplied, depth is metres along
             the ray where half of the light is gone, 0 where less is lost.

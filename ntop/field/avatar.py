@@ -21,6 +21,7 @@ from ntop.field.canonical import CanonicalGrid
 from ntop.field.kernels.tables import VOID_RAW
 
 FORMAT = 1
+FIELD = "grid"
 ARRAYS_NAME = "avatar.safetensors"
 HEADER_NAME = "avatar.json"
 
@@ -40,6 +41,49 @@ class Avatar:
     step: int
 
 
+@dataclass(frozen=True)
+class AvatarFiles:
+    """An avatar's two files, of whatever field: the header, and arrays whose hash it names."""
+
+    folder: Path
+    header: dict[str, Any]
+    content: bytes
+
+    @property
+    def field(self) -> str:
+        """Which kind of field; headers without one are older than the second kind."""
+        return self.header.get("field", FIELD)
+
+
+def read_avatar_files(folder: Path) -> AvatarFiles:
+    """Read and check both files.
+
+    Raises:
+        DataError: a file is missing or broken, of another format, or not the one its header names.
+    """
+    try:
+        header = json.loads((folder / HEADER_NAME).read_text())
+        content = (folder / ARRAYS_NAME).read_bytes()
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read avatar {folder}: {error}; train it again") from error
+    digest = hashlib.sha256(content).hexdigest()
+    if header.get("format") != FORMAT or header.get("sha256") != digest:
+        raise DataError(
+            f"avatar {folder}: format {header.get('format')}, arrays' sha256 {digest[:12]}; "
+            f"expected format {FORMAT} and {str(header.get('sha256'))[:12]}; train it again"
+        )
+    return AvatarFiles(folder, header, content)
+
+
+def write_avatar_files(header: dict[str, Any], content: bytes, folder: Path, *, write: Any) -> str:
+    """Write both files through `write(path, bytes)` and return the arrays' sha256."""
+    digest = hashlib.sha256(content).hexdigest()
+    full = {"format": FORMAT, "ntop": __version__, "sha256": digest, **header}
+    write(folder / ARRAYS_NAME, content)
+    write(folder / HEADER_NAME, (json.dumps(full, indent=1) + "\n").encode())
+    return digest
+
+
 def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
     """Write both files through `write(path, bytes)` and return the arrays' sha256.
 
@@ -54,11 +98,8 @@ def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
             "light": avatar.light.astype(np.float32),
         }
     )
-    digest = hashlib.sha256(content).hexdigest()
     header = {
-        "format": FORMAT,
-        "ntop": __version__,
-        "sha256": digest,
+        "field": FIELD,
         "step": avatar.step,
         "betas": list(avatar.betas),
         "reach_m": avatar.reach_m,
@@ -67,31 +108,34 @@ def save_avatar(avatar: Avatar, folder: Path, *, write: Any) -> str:
         "bricks": list(grid.bricks.shape),
         "void_raw": VOID_RAW,
     }
-    write(folder / ARRAYS_NAME, content)
-    write(folder / HEADER_NAME, (json.dumps(header, indent=1) + "\n").encode())
-    return digest
+    return write_avatar_files(header, content, folder, write=write)
 
 
 def load_avatar(folder: Path) -> Avatar:
-    """Read an avatar.
+    """Read a grid's avatar; `ntop.field.interface` reads any.
 
     Raises:
-        DataError: a file is missing or broken, of another format, or not the one its header names;
-            or a number in it is not finite, or a length not positive.
+        DataError: a file is missing or broken, of another format or field, or not the one its
+            header names.
     """
-    try:
-        header = json.loads((folder / HEADER_NAME).read_text())
-        content = (folder / ARRAYS_NAME).read_bytes()
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot read avatar {folder}: {error}; train it again") from error
-    digest = hashlib.sha256(content).hexdigest()
-    if header.get("format") != FORMAT or header.get("sha256") != digest:
+    files = read_avatar_files(folder)
+    if files.field != FIELD:
         raise DataError(
-            f"avatar {folder}: format {header.get('format')}, arrays' sha256 {digest[:12]}; "
-            f"expected format {FORMAT} and {str(header.get('sha256'))[:12]}; train it again"
+            f"avatar {folder}: field {files.field!r}, expected {FIELD!r}; this needs a grid"
         )
+    return grid_from_files(files)
+
+
+def grid_from_files(files: AvatarFiles) -> Avatar:
+    """The avatar of files whose header says that they are a grid's.
+
+    Raises:
+        DataError: arrays or header do not fit together, or a number in them is not finite, or a
+            length not positive.
+    """
+    folder, header = files.folder, files.header
     try:
-        arrays = safetensors.numpy.load(content)
+        arrays = safetensors.numpy.load(files.content)
         betas = tuple(float(x) for x in header["betas"])
         positions, stored = arrays["positions"], arrays["values"]
         bricks = np.zeros(header["bricks"], np.int32)

@@ -90,11 +90,7 @@ def content_digest(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> str
 
 
 def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
-    """Write the state atomically: a new file beside the old one, then one rename.
-
-    Raises:
-        DataError: the folder cannot be written, or the disk is full.
-    """
+    """Write the state (see `write_checkpoint`)."""
     arrays = {name: getattr(state, name) for name in ARRAYS}
     arrays |= {f"grid_{name}": getattr(state.grid, name) for name in GRID_ARRAYS}
     arrays |= {"occupancy": state.occupancy.cells, "occupancy_origin": state.occupancy.origin}
@@ -108,6 +104,15 @@ def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
         "step": state.step,
         "curve": [dataclasses.astuple(line) for line in state.curve],
     }
+    write_checkpoint(arrays, header, path)
+
+
+def write_checkpoint(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> None:
+    """Write arrays and header atomically: a new file beside the old one, then one rename.
+
+    Raises:
+        DataError: the folder cannot be written, or the disk is full.
+    """
     metadata = {"state": json.dumps(header), "sha256": content_digest(arrays, header)}
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -133,20 +138,10 @@ def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | No
     Raises:
         DataError: the file is damaged.
     """
-    if not path.exists():
+    found = read_checkpoint(path)
+    if found is None or found[1]["settings"] != settings_digest(settings):
         return None
-    try:
-        with safetensors.safe_open(path, framework="numpy") as stream:
-            header = json.loads(stream.metadata()["state"])
-            arrays = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-            if content_digest(arrays, header) != stream.metadata()["sha256"]:
-                raise ValueError("its content is not what was saved")
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise DataError(
-            f"checkpoint {path} is damaged ({error}); delete it, then run the same command again"
-        ) from error
-    if header["settings"] != settings_digest(settings):
-        return None
+    arrays, header = found
     grid = CanonicalGrid(
         **{name: arrays[f"grid_{name}"] for name in GRID_ARRAYS}, voxel_m=header["voxel_m"]
     )
@@ -160,3 +155,24 @@ def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | No
         curve=[line(*values) for values in header["curve"]],
         **{name: arrays[name] for name in ARRAYS},
     )
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+    """What `write_checkpoint` wrote; None where there is none.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    try:
+        with safetensors.safe_open(path, framework="numpy") as stream:
+            header = json.loads(stream.metadata()["state"])
+            arrays = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+            if content_digest(arrays, header) != stream.metadata()["sha256"]:
+                raise ValueError("its content is not what was saved")
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise DataError(
+            f"checkpoint {path} is damaged ({error}); delete it, then run the same command again"
+        ) from error
+    return arrays, header

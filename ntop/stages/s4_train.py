@@ -2,7 +2,7 @@
 
 | written below `out` | what |
 |---|---|
-| `avatar.safetensors`, `avatar.json` | the canonical field and its header (ntop.field.avatar) |
+| `avatar.safetensors`, `avatar.json` | the field and its header (ntop.field.interface) |
 | `curve.parquet` (schema CURVE) | loss and PSNR per step, watched frames now and then |
 | `provenance.json` | configuration, code and inputs |
 
@@ -12,17 +12,25 @@ A stopped training continues at its last checkpoint in the work folder, with the
 import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import assert_never
 
 import torch
 
-from ntop.body.model import load_body_model
+from ntop.body.model import BodyModel, load_body_model
 from ntop.captures.training_views import Tables, training_views
 from ntop.config.sections import TrainConfig
-from ntop.field.avatar import save_avatar
 from ntop.field.devices import kernel_words
+from ntop.field.humannerf.device import compute_device, device_words
+from ntop.field.humannerf.settings import HumanNerfSettings
+from ntop.field.humannerf.settings import Progress as HumanNerfProgress
+from ntop.field.humannerf.training import train_humannerf
+from ntop.field.interface import AnyAvatar, save_avatar
 from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
+from ntop.field.views import TrainingViews
+from ntop.metrics.lpips import load_lpips
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
@@ -57,11 +65,11 @@ def main(
     """
     torch.set_num_threads(1)  # the kernels have their own threads
     check_files(capture, cameras.parent, masks.parent, bodies.parent)
-    sys.stderr.write(f"train: {kernel_words()}\n")
     tables = Tables(capture / "frames.parquet", cameras, masks, bodies)
     inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
+    if config.field == "humannerf" and config.humannerf.lpips_weights:
+        inputs["lpips_weights"] = file_sha256(Path(config.humannerf.lpips_weights))
     values = config.model_dump(mode="json")
-    settings = training_settings(config)
     model = load_body_model(config.body_path)
     recipe = {"config": values, "inputs": inputs, "code": code_sha256()}
     with work_folder(work, recipe=recipe) as content, termination_flag() as terminated:
@@ -72,15 +80,12 @@ def main(
             max_person_px=config.max_person_px,
             margin_m=config.reach_m,
         )
-        betas = tuple(float(value) for value in views.poses.betas[0])
         try:
-            avatar, curve = train(
+            avatar, curve = train_field(
+                config,
                 views,
                 model,
-                betas,
-                settings=settings,
                 checkpoint_path=content / CHECKPOINT_NAME,
-                on_step=_Reporter(settings.steps),
                 stop_requested=terminated,
             )
         except TrainingStoppedError as stopped:
@@ -94,6 +99,56 @@ def main(
             write_provenance(record, folder=folder)
             record_files(folder)
         clear_work(work)
+
+
+def train_field(
+    config: TrainConfig,
+    views: TrainingViews,
+    model: BodyModel,
+    *,
+    checkpoint_path: Path,
+    stop_requested: Callable[[], bool],
+) -> tuple[AnyAvatar, list[Progress] | list[HumanNerfProgress]]:
+    """Train the configured kind of avatar.
+
+    Raises:
+        TrainingStoppedError: `stop_requested` became true; the state is saved.
+    """
+    betas = tuple(float(value) for value in views.poses.betas[0])
+    piece = {"checkpoint_path": checkpoint_path, "stop_requested": stop_requested}
+    match config.field:
+        case "grid":
+            sys.stderr.write(f"train: {kernel_words()}\n")
+            settings = training_settings(config)
+            return train(
+                views, model, betas, settings=settings, on_step=_Reporter(settings.steps), **piece
+            )
+        case "humannerf":
+            sys.stderr.write(f"train: {device_words()}\n")
+            weights = config.humannerf.lpips_weights
+            return train_humannerf(
+                views,
+                model,
+                betas,
+                settings=humannerf_settings(config),
+                perceptual=load_lpips(Path(weights), device=compute_device()) if weights else None,
+                on_step=_Reporter(config.humannerf.steps),
+                **piece,
+            )
+        case _:
+            assert_never(config.field)
+
+
+def humannerf_settings(config: TrainConfig) -> HumanNerfSettings:
+    """The twin's settings for a configuration; what it does not say is the paper's."""
+    section = config.humannerf
+    return HumanNerfSettings(
+        steps=section.steps,
+        patches=section.patches,
+        patch_px=section.patch_px,
+        samples=section.samples,
+        seed=config.seed,
+    )
 
 
 def training_settings(config: TrainConfig) -> TrainingSettings:
@@ -124,7 +179,7 @@ class _Reporter:
         self._first: tuple[int, float] | None = None
         self._last_s = 0.0
 
-    def __call__(self, line: Progress) -> None:
+    def __call__(self, line: Progress | HumanNerfProgress) -> None:
         now_s = time.monotonic()
         if self._first is None:
             self._first = (line.step, now_s)  # the first step's time is compilation

@@ -23,9 +23,9 @@ from ntop.body.skinning import BodyPose
 from ntop.config.rigs import configured_rig
 from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
-from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
-from ntop.field.devices import kernel_words
-from ntop.field.rendering import PRESETS, Rendering, pose_avatar, render_view
+from ntop.field.avatar import ARRAYS_NAME
+from ntop.field.interface import AnyAvatar, compute_words, load_avatar, pose_avatar, render_view
+from ntop.field.rendering import PRESETS, Rendering
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.stages import VERSIONS
 from ntop.storage import schemas
@@ -75,7 +75,6 @@ def main(
     torch.set_num_threads(1)  # posing is small; the kernels have their own threads
     check_files(avatar, packages / CLIPS)
     check_files(bodies.parent, only={bodies.name})
-    sys.stderr.write(f"render: {kernel_words()}\n")
     keys = [SetKey(source, actor, action, rig, frame) for frame in sorted(frames)]
     rows = [row for row in read_bodies(bodies) if (row["source"], row["actor"]) == (source, actor)]
     if not rows:
@@ -107,6 +106,7 @@ def main(
                 avatar_sha256=avatar_sha256,
                 config=config,
             )
+            sys.stderr.write(f"render: {compute_words(studio.avatar)}\n")
             render_sets(missing, poses, studio, content=content, terminated=terminated)
         inputs = {"avatar": avatar_sha256, "bodies": recipe["bodies"]}
         record = provenance(
@@ -121,7 +121,7 @@ def main(
 class Studio:
     """What all sets of a shard share."""
 
-    avatar: Avatar
+    avatar: AnyAvatar
     model: BodyModel
     rig: Rig
     avatar_sha256: str

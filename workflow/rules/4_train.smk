@@ -5,6 +5,7 @@ rule train:
         mattes=matte_folder,
         bodies=body_folder,
         model=body_model,
+        perceptual=perceptual_package,
     output:
         directory("results/4_train/{source}/{actor}"),
     log:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ntop.config.plan import shard_frames
 from ntop.config.run import load_run
+from ntop.config.sections import TrainConfig
 from ntop.config.whole import body_model_of, stage_section
 from ntop.conventions import ConfigError
 from ntop.stages import VERSIONS
@@ -173,6 +174,14 @@ def mask_packages(wildcards):
         wildcards, "keypoints2d"
     )
     return package_folders(["mediapipe"] if needs_network else [])
+
+
+def perceptual_package(wildcards):
+    """The package with the perceptual loss's weights, where the actor's avatar asks for them."""
+    section = TrainConfig(**stage_section(CONFIG, "train", source=wildcards.source))
+    path = Path(section.humannerf.lpips_weights)
+    fetched = section.field == "humannerf" and path.is_relative_to(PACKAGES)
+    return [str(path.parent)] if fetched else []
 
 
 def render_packages(wildcards):

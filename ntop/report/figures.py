@@ -140,6 +140,11 @@ CHECKS = (
         "The same in the box of the fisheye views with known truth.", at_least=7,
     ),
     Meaning(
+        "avatar.converged", "HumanNeRF avatars, converged", "",
+        "Share with at least 30,000 iterations; others tell of their time, not of the method.",
+        at_least=1,
+    ),
+    Meaning(
         "checks.images", "images checked", "",
         "What the checks of labels and masks looked at: all, or sets spread evenly over actors "
         "and rigs (evaluate.max_sets). `ntop check` reads every file.",

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ntop.body.model import BodyModel
 from ntop.conventions import PIXEL_CENTRE
-from ntop.field.avatar import load_avatar
+from ntop.field.avatar import FIELD, load_avatar, read_avatar_files
 from ntop.field.paper_sampler import SAMPLES, render_paper_view
 from ntop.field.rendering import (
     PosedAvatar,
@@ -145,8 +145,14 @@ def check_stripes(
     model_of: Callable[[ActorFolders], BodyModel],
     settings: RenderSettings | None = None,
 ) -> list[StripeCheck]:
-    """One set of every rig, actors taking turns; rigs in which nobody is seen are left out."""
+    """One set of every rig, actors taking turns; rigs in which nobody is seen are left out.
+
+    Only grids have a sampler to shift: actors with another field are left out.
+    """
     settings = settings or RenderSettings()
+    actors = [actor for actor in actors if read_avatar_files(actor.avatar).field == FIELD]
+    if not actors:
+        return []
     checks = []
     for turn, rig in enumerate(sorted({key.rig for key in dataset.sets})):
         for actor in [*actors[turn % len(actors) :], *actors[: turn % len(actors)]]:

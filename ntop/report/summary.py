@@ -4,13 +4,13 @@ import json
 import platform
 from collections import Counter
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from ntop.conventions import DataError
 from ntop.report.figures import CHECKS, MEANINGS, Figure, figure
 from ntop.report.inputs import ActorFolders, Dataset
 from ntop.report.page import Table
+from ntop.report.training import avatar_header, training_note
 from ntop.storage import schemas
 from ntop.storage.tables import read_table
 
@@ -120,22 +120,23 @@ def provenance_rows(
     record: dict[str, Any], actors: list[ActorFolders]
 ) -> tuple[tuple[str, str], ...]:
     """What made the dataset and this page."""
+    notes = [(actor, training_note(actor)) for actor in actors]
     versions = ", ".join(f"{name} {number}" for name, number in record["stage_versions"].items())
     return (
         ("ntop", record["ntop_version"]),
         ("stage versions", versions),
         ("code, SHA-256", record["code_sha256"]),
         ("configuration, SHA-256", record["config_sha256"]),
-        *((f"avatar of {actor.name}, SHA-256", _avatar_sha256(actor.avatar)) for actor in actors),
+        *((f"avatar of {actor.name}, SHA-256", _avatar_sha256(actor)) for actor in actors),
+        *((f"avatar of {actor.name}, training", note) for actor, note in notes if note),
         ("Python", platform.python_version()),
         ("libraries", ", ".join(f"{name} {version(name)}" for name in PACKAGES)),
         ("machine", f"{platform.system()} {platform.machine()}"),
     )
 
 
-def _avatar_sha256(folder: Path) -> str:
-    path = folder / "avatar.json"
-    try:
-        return json.loads(path.read_text())["sha256"]
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"cannot read {path}: {error!r}; rerun the training") from error
+def _avatar_sha256(actor: ActorFolders) -> str:
+    header = avatar_header(actor)
+    if "sha256" not in header:
+        raise DataError(f"{actor.avatar}/avatar.json names no sha256; rerun the training")
+    return header["sha256"]

@@ -12,8 +12,7 @@ from ntop.body.skinning import BodyPose
 from ntop.config.sections import EvaluateConfig
 from ntop.config.tables import Actor, read_tsv
 from ntop.conventions import ConfigError, DataError
-from ntop.field.avatar import load_avatar
-from ntop.field.rendering import pose_avatar, render_view
+from ntop.field.interface import load_avatar, pose_avatar, render_view
 from ntop.geometry.cameras import Camera
 from ntop.masks.polygons import read_polygon_masks
 from ntop.metrics.images import Cutout
@@ -51,7 +50,7 @@ from ntop.report.summary import (
     statistics_table,
     tiles,
 )
-from ntop.report.training import training_charts
+from ntop.report.training import training_charts, training_values
 from ntop.report.truth import score_truth, truth_comparison, truth_values
 from ntop.storage.atomic import atomic_folder
 from ntop.storage.files import check_files
@@ -139,7 +138,7 @@ def report_actor(config: EvaluateConfig, dataset: Dataset, actor: ActorFolders) 
     render = avatar_renderer(actor, model)
     seen = {view for _, _, view in recording.mattes} - held_out
     paint = painted_body(recording, model, views=seen).cutout
-    values = fit_values(actor)
+    values = fit_values(actor) | training_values(actor)
     heldout = truth = None
     exhibits = actor_exhibits(dataset, actor)
     references = reference_masks(config, actor.source)

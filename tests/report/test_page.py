@@ -3,6 +3,8 @@
 import base64
 import json
 import re
+import shutil
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import cv2
@@ -29,7 +31,8 @@ from ntop.report.pictures import (
     skeleton_svg,
     square_around,
 )
-from ntop.report.training import training_charts
+from ntop.report.summary import provenance_rows, read_dataset_record
+from ntop.report.training import training_charts, training_note, training_values
 from ntop.storage.images import read_rgba
 from tests.report.small_world import cutout, pose, side_cameras
 
@@ -196,6 +199,27 @@ def test_training_charts_come_from_the_curves(world):
     assert "Training loss" in loss and loss.count("<polyline") == 2
     assert "PSNR" in charts["watched_psnr_db"].figure
     assert training_charts([world.real])["loss"].title == "Training loss: real/p00"
+
+
+def test_an_unconverged_avatar_is_called_so(world, tmp_path):
+    actor = world.actors[0]
+    folder = shutil.copytree(actor.avatar, tmp_path / "avatar")
+    header = json.loads((folder / "avatar.json").read_text())
+    assert training_note(actor) == "" and training_values(actor) == {}
+    record = {"iterations": 1200, "planned": 100_000, "loss": "0.2 MSE", "converged": False}
+    header |= {"field": "humannerf", "training": record}
+    (folder / "avatar.json").write_text(json.dumps(header))
+    twin = replace(actor, avatar=folder)
+    assert training_values(twin) == {
+        "avatar.iterations": 1200, "avatar.iterations_planned": 100_000, "avatar.converged": 0.0,
+    }  # fmt: skip
+    assert training_note(twin) == (
+        "humannerf, 1,200 of 100,000 iterations, unconverged (fewer than 30,000), loss 0.2 MSE"
+    )
+    assert f"{twin.name} (unconverged)" in training_charts([twin])["loss"].title
+    dataset = Dataset.read(world.dataset)
+    rows = dict(provenance_rows(read_dataset_record(dataset), [twin]))
+    assert rows[f"avatar of {twin.name}, training"] == training_note(twin)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint bench bench-scale numerics chaos rulegraph
+.PHONY: env demo studio test lint bench bench-field bench-scale numerics chaos rulegraph
 
 env: $(VENV)/.ready
 
@@ -64,6 +64,10 @@ bench: env
 	$(RUN) python -m benchmarks.quadrature
 	$(RUN) python -m benchmarks.skipping
 	$(RUN) python scripts/write_benchmarks_page.py
+
+# quality over training time, grid and twin; hours on an idle machine, BENCH=--quick is a smoke test
+bench-field: env
+	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.field $(BENCH)
 
 rulegraph: env
 	$(RUN) scripts/draw_rulegraph.sh

@@ -72,7 +72,8 @@ def kill_group(stage: str) -> Strike:
             for group in groups:
                 os.killpg(group, signal.SIGKILL)
         wait_for_end(space)
-        return Hit(f"SIGKILL to {len(groups)} process groups after {after}")
+        count = "the process group" if len(groups) == 1 else f"{len(groups)} process groups"
+        return Hit(f"SIGKILL to {count} of head and worker after {after}")
 
     return strike
 

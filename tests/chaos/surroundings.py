@@ -4,6 +4,7 @@ import random
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 from tests.chaos.signals import wait_for_end
@@ -59,12 +60,14 @@ def wrong_clock(stage: str) -> Strike:
         space.undo(stage)
         clock = {"LD_PRELOAD": str(FAKETIME), "FAKETIME": f"{days:+d}d", "NTOP_LOCK_WAIT_S": "30"}
         shown = subprocess.run(
-            ["date", "+%Y"],
+            ["date", "+%s"],
             env=space.environment | clock,
             capture_output=True,
             text=True,
             check=True,
-        ).stdout
+        )
+        seen_days = round((int(shown.stdout) - time.time()) / 86400)
+        assert seen_days == days, f"the clock is off by {seen_days} days, wanted {days}"
         space.start(**clock)
         space.worker(stage)
         killed = chance.random() < 0.5
@@ -73,7 +76,7 @@ def wrong_clock(stage: str) -> Strike:
         else:
             assert wait_for_end(space) == 0, space.said()
         ended = "killed" if killed else "finished"
-        return Hit(f"a run {days:+d} days off (`date` said {shown.strip()}) was {ended}")
+        return Hit(f"a run whose clock was {days:+d} days off was {ended}")
 
     return strike
 

@@ -17,6 +17,7 @@ from tests.chaos.workspace import DATASET, TooLateError, Workspace
 from tests.workflow.project import Project
 
 ATTEMPTS = 5  # to hit the moment
+NOT_TRIED = "LOST: not tried"
 COMMANDS = 5  # of the user, until the dataset is whole
 
 Strike = Callable[[Workspace, random.Random], "Hit"]
@@ -80,7 +81,7 @@ def run_trial(number: int, kind: Kind, seed: int, *, finished: Project, place: P
         break
     else:
         hit, seconds = Hit(f"the moment was missed {ATTEMPTS} times"), 0.0
-        outcome, survived = "LOST: not tried", False
+        outcome, survived = NOT_TRIED, False
     return Outcome(
         number=number,
         seed=seed,

@@ -35,11 +35,17 @@ done
 ntop status "${files[@]}" --every-s "${NTOP_PROGRESS_S:-60}" 9>&- &
 trap 'kill $! 2>/dev/null || true' EXIT
 if ! snakemake --cores "$cores" --quiet progress "$@"; then
-  # what Snakemake itself cannot write it names in a traceback, without a word about what to do
+  # what Snakemake itself stumbles over it names without a word about what to do
   stuck=$(find results logs -type d ! -writable -print -quit 2>/dev/null || true)
   if [[ -n $stuck ]]; then
     echo "ntop: cannot write $stuck: Read-only file system, or another user's folder; check the" \
       "mount and the permissions, then run the same command again" >&2
+  fi
+  ahead=$(find results -newermt "now + 1 minute" -print -quit 2>/dev/null || true)
+  if [[ -n $ahead ]]; then
+    echo "ntop: $ahead was written in the future: a clock is or was wrong. If it is right now, give" \
+      "such files one time that is not ahead, then run the same command again:" >&2
+    echo "  find results -newermt now -exec touch --date '$(date '+%F %T')' {} +" >&2
   fi
   exit 1
 fi

@@ -161,7 +161,8 @@ def catches_sigterm(pid: int) -> bool:
 
 def pieces(content: Path) -> list[str]:
     """Finished sets or checkpoints below a work folder."""
-    return [path.name for path in content.glob("*") if not path.name.startswith(".")]
+    names = [path.name for path in content.glob("*")]
+    return [name for name in names if not name.startswith(".") and not name.endswith(".tmp")]
 
 
 @contextlib.contextmanager

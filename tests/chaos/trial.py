@@ -146,6 +146,9 @@ def remedy_in(said: str, space: Workspace, steps: list[str]) -> list[str]:
     elif re.search(r"cannot .*Read-only file system.*permissions", said):
         space.remount("rw")
         steps.append("made writable")
+    elif ahead := re.search(r"^  (find results .*)$", said, re.MULTILINE):
+        subprocess.run(ahead[1], shell=True, cwd=space.folder, check=True)
+        steps.append("times set as it says")
     elif orphans := re.search(r"^  kill ([0-9 ]+)$", said, re.MULTILINE):
         for process in space.processes(lambda words: "--out" in words):
             if str(process.pid) in orphans[1].split():

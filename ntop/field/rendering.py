@@ -23,9 +23,9 @@ from ntop.field.canonical import (
     dense_voxels,
     label_grid,
 )
-from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tables import EMPTY_RAW
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
+from ntop.field.marching import MarchRule, Rays, Scene, march_rays
 from ntop.field.warp import PoseWarp, occupied, pose_warp, with_octants
 from ntop.geometry.cameras import Camera, Lens
 
@@ -177,22 +177,17 @@ def trace_rays(
     count = len(directions_world)
     origin = center_world.double().numpy() - posed.warp.origin_world
     directions = unit_directions(origin, directions_world.double().numpy())
-    colours = np.empty((count, 3), np.float32)
-    opacity = np.empty(count, np.float32)
-    depth = np.empty(count, np.float32)
-    parts = np.empty(count, np.uint8)
-    evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
-    render_rays(
-        posed.grid.tables(), posed.warp.tables, posed.light, posed.labels.values,
-        posed.labels.origin, 1 / posed.labels.spacing_m, np.zeros(1, np.int64), origin[None],
-        directions, np.full(count, settings.phase), settings.step_m, settings.stop_transmittance,
-        settings.colour_floor, settings.intervals, colours, opacity, depth, parts, evaluations,
-    )  # fmt: skip
-    if not (np.isfinite(colours).all() and np.isfinite(opacity).all()):
+    scene = Scene(posed.grid.tables(), posed.warp.tables, posed.light, posed.labels)
+    rays = Rays(np.zeros(1, np.int64), origin[None], directions, np.full(count, settings.phase))
+    rule = MarchRule(
+        settings.step_m, settings.stop_transmittance, settings.colour_floor, settings.intervals
+    )
+    seen = march_rays(scene, rays, rule)
+    if not (np.isfinite(seen.colours).all() and np.isfinite(seen.opacity).all()):
         raise DataError(
             "rendered pixels are not finite: the avatar holds NaN or infinity; train it again"
         )
-    return RayRendering(colours, opacity, depth, parts, int(evaluations.sum()))
+    return RayRendering(*seen)
 
 
 def unit_directions(

@@ -15,6 +15,7 @@ from ntop.body.skinning import BodyPose
 from ntop.field.avatar import Avatar
 from ntop.field.canonical import (
     CanonicalBody,
+    PartLabels,
     body_density,
     canonical_body,
     initial_grid,
@@ -22,10 +23,10 @@ from ntop.field.canonical import (
     refined_grid,
 )
 from ntop.field.checkpoints import TrainingState, load_checkpoint, save_checkpoint
-from ntop.field.kernels.adjoint import train_rays
-from ntop.field.kernels.learn import adam_step, gather
-from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
+from ntop.field.devices import kernel_device
 from ntop.field.kernels.tables import WarpTables
+from ntop.field.learners import CpuLearner, Learner, StepRule, StepSums
+from ntop.field.marching import MarchRule, Rays, Scene, march_on_cpu
 from ntop.field.views import RayBatch, RaySource, TrainingViews
 from ntop.field.warp import joined, occupied, octant_radius_m, pose_warp
 
@@ -33,6 +34,8 @@ WATCHED_RAYS = 16384
 BETAS = (0.9, 0.99)
 VALUE_BOUNDS = ((-12.0, -8.0, -8.0, -8.0), (30.0, 8.0, 8.0, 8.0))
 PRIOR_RAYS = 8192  # rays per step for which the priors' weights are stated; losses are sums
+PRIOR_EDGE = (0.5, 0.1, 0.1, 0.1)  # width of the smoothness prior's rounded tip per channel
+STOP_TRANSMITTANCE = 1e-3
 TINY_MSE = 1e-10
 BODY_VOXEL_M = 0.008  # of the body's own density, which others are anchored to
 
@@ -121,9 +124,11 @@ def train(
             on_step(state.curve[-1])
         saving = state.step % settings.checkpoint_every == 0 or stop_requested()
         if checkpoint_path is not None and saving:
+            trainer.settle()
             save_checkpoint(state, checkpoint_path, settings)
         if stop_requested():
             raise TrainingStoppedError(f"stopped after step {state.step} of {settings.steps}")
+    trainer.settle()
     state = trainer.state
     avatar = Avatar(state.grid, state.light.astype(np.float32), betas, settings.outer_m, state.step)
     return avatar, state.curve
@@ -190,15 +195,22 @@ class _Trainer:
         )
         self._settings = settings
         self._tables = occupied(tables, state.occupancy)
-        self._allocate()
+        self._learner = self._new_learner()
 
-    def _allocate(self) -> None:
-        rows, slots = len(self.state.grid.values), len(self.state.grid.positions)
-        blocks = self._settings.ray_blocks
-        self._gradients = np.zeros((blocks, rows, 4), np.float32)
-        sharpness = self._settings.sharpness[self.state.level]
-        self._anchors = body_density(self._body_grid, self.state.grid, sharpness=sharpness)
-        self._touched = np.zeros((blocks, slots), np.uint8)
+    def _new_learner(self) -> Learner:
+        settings, state = self._settings, self.state
+        anchors = body_density(
+            self._body_grid, state.grid, sharpness=settings.sharpness[state.level]
+        )
+        if kernel_device().gpu:
+            from ntop.field.gpu import GpuLearner  # numba.cuda only where it is used
+
+            return GpuLearner(state, self._tables, anchors)
+        return CpuLearner(state, self._tables, anchors, blocks=settings.ray_blocks)
+
+    def settle(self) -> None:
+        """Make the state's arrays hold what was learned."""
+        self._learner.settle()
 
     def step(self, source: RaySource, watched: RayBatch | None) -> None:
         """One step: rays, gradients, update, and what is due at this step's number."""
@@ -207,70 +219,58 @@ class _Trainer:
         batch = source.draw(
             settings.rays_per_batch, num_views=settings.views_per_batch, generator=generator
         )
-        losses = self._accumulate(batch)
-        active = np.flatnonzero(self._touched.any(0))
-        active = active[active > 0]
+        rule = self._rule()
+        sums = self._learner.accumulate(batch, rule)
+        active = self._learner.touched()
         if (state.step + 1) % settings.smooth_all_every == 0:
             active = np.arange(1, len(state.grid.positions))
-        self._learn(active)
+        self._learner.learn(active, rule)
+        self._learn_colours(sums)
         step = state.step + 1
         person = max(float((batch.mattes > 0.5).sum()), 1.0)
         due = watched is not None and (step % settings.watch_every == 0 or step == settings.steps)
         progress = Progress(
             step=step,
-            loss=float(losses[0] + losses[2]) / len(batch.mattes),
-            psnr_person_db=psnr_db(float(losses[1]) / person / 3),
+            loss=float(sums.losses[0] + sums.losses[2]) / len(batch.mattes),
+            psnr_person_db=psnr_db(float(sums.losses[1]) / person / 3),
             watched_psnr_db=self._watched_psnr(watched) if due else float("nan"),
             active_bricks=len(active),
         )
         self.state = replace(state, step=step, curve=[*state.curve, progress])
         self._reshape()
 
-    def _accumulate(self, batch: RayBatch) -> np.ndarray:
-        settings, state = self._settings, self.state
-        blocks = settings.ray_blocks
-        self._light_gradients = np.zeros((blocks, 9, 3))
-        self._gain_gradients = np.zeros((blocks, *state.gain.shape))
-        losses = np.zeros((blocks, 3))
-        train_rays(
-            state.grid.tables(), self._tables, state.light, state.gain, batch.poses,
-            batch.cameras, batch.origins, batch.directions, batch.offsets, batch.targets,
-            batch.mattes, batch.colour_weights, batch.matte_weights * settings.matte_weight,
-            batch.backgrounds, _march_step(state, settings), 1e-3, settings.entropy_weight,
-            self._gradients, self._touched, self._light_gradients, self._gain_gradients, losses,
-        )  # fmt: skip
-        return losses.sum(0)
-
-    def _learn(self, active: np.ndarray) -> None:
+    def _rule(self) -> StepRule:
         settings, state = self._settings, self.state
         share = state.step / settings.steps
         colour = _decayed(settings.colour_rate, share)
-        rates = np.array([_decayed(settings.density_rate, share), colour, colour, colour])
         prior = settings.rays_per_batch / PRIOR_RAYS
         smooth = np.array([settings.density_smoothness, *[settings.colour_smoothness] * 3])
-        gather(
-            state.grid.values, state.grid.bricks, state.grid.positions, active, self._gradients,
-            self._touched, prior * smooth, np.array([0.5, 0.1, 0.1, 0.1]), self._anchors,
-            prior * settings.body_weight,
-        )  # fmt: skip
-        low, high = (np.array(bound) for bound in VALUE_BOUNDS)
-        adam_step(
-            state.grid.values, active, self._gradients, state.first, state.second, state.counts,
-            rates, *BETAS, low, high,
-        )  # fmt: skip
-        self._gradients[0, :64] = 0  # the void does not learn
-        self._gradients[1:, :64] = 0
-        self._touched[:, 0] = 0
-        rate = _decayed(settings.light_rate, share)
+        return StepRule(
+            step_m=_march_step(state, settings),
+            stop=STOP_TRANSMITTANCE,
+            matte_weight=settings.matte_weight,
+            entropy_weight=settings.entropy_weight,
+            smoothness=prior * smooth,
+            edge=np.array(PRIOR_EDGE),
+            body_weight=prior * settings.body_weight,
+            rates=np.array([_decayed(settings.density_rate, share), colour, colour, colour]),
+            betas=BETAS,
+            low=np.array(VALUE_BOUNDS[0]),
+            high=np.array(VALUE_BOUNDS[1]),
+        )
+
+    def _learn_colours(self, sums: StepSums) -> None:
+        """Light and cameras' colours, the few values that every ray sees."""
+        settings, state = self._settings, self.state
+        rate = _decayed(settings.light_rate, state.step / settings.steps)
         if settings.light:
-            _small_adam(
-                state.light, self._light_gradients.sum(0), state.light_moments, state.step, rate
-            )
+            _small_adam(state.light, sums.light, state.light_moments, state.step, rate)
         if settings.camera_colour:
-            gradient = self._gain_gradients.sum(0) + 0.01 * settings.rays_per_batch * state.gain
+            gradient = sums.gain + 0.01 * settings.rays_per_batch * state.gain
             _small_adam(state.gain, gradient, state.gain_moments, state.step, 0.3 * rate)
 
     def _watched_psnr(self, batch: RayBatch) -> float:
+        self.settle()
         return watched_psnr(self.state, self._tables, batch, self._settings)
 
     def _reshape(self) -> None:
@@ -279,6 +279,7 @@ class _Trainer:
         level = level_at(state.step, settings)
         finer = level > state.level
         if finer or state.step % settings.occupancy_every == 0:
+            self.settle()
             occupancy = _occupancy(state.grid, settings)
             if finer:
                 grid = refined_grid(state.grid, occupancy, voxel_m=settings.voxels_m[level])
@@ -286,9 +287,12 @@ class _Trainer:
                 low, high = VALUE_BOUNDS[0][0], VALUE_BOUNDS[1][0]
                 grid.values[:, 0] = np.clip(steeper * grid.values[:, 0], low, high)
                 self.state = state.with_grid(grid, level=level)
-                self._allocate()
             self.state = replace(self.state, occupancy=occupancy)
             self._tables = occupied(self._tables, occupancy)
+            if finer:
+                self._learner = self._new_learner()
+            else:
+                self._learner.see(self._tables)
 
 
 def level_at(step: int, settings: TrainingSettings) -> int:
@@ -306,19 +310,16 @@ def watched_psnr(
     state: TrainingState, tables: WarpTables, batch: RayBatch, settings: TrainingSettings
 ) -> float:
     """PSNR of rays of the views set aside, over black."""
-    count = len(batch.poses)
-    colours, opacity = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-    render_rays(
-        state.grid.tables(), tables, state.light.astype(np.float32), np.zeros((1, 1, 1), np.uint8),
-        np.zeros(3), 1.0, batch.poses, batch.origins, batch.directions, np.full(count, 0.5),
-        _march_step(state, settings), 1e-3, 0.0, True, colours, opacity,
-        np.empty(count, np.float32), np.empty(count, np.uint8),
-        np.zeros(-(-count // RAYS_PER_CHUNK), np.int64),
-    )  # fmt: skip
+    unlabelled = PartLabels(np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0)
+    scene = Scene(state.grid.tables(), tables, state.light.astype(np.float32), unlabelled)
+    offsets = np.full(len(batch.poses), 0.5)
+    rays = Rays(batch.poses, batch.origins, batch.directions, offsets)
+    rule = MarchRule(_march_step(state, settings), STOP_TRANSMITTANCE, 0.0, skipping=True)
+    seen = march_on_cpu(scene, rays, rule)  # the state's arrays may change where they are
     gain = state.gain[batch.cameras]
-    seen = colours * np.exp(gain[:, 0]) + gain[:, 1] * opacity[:, None]
+    colours = seen.colours * np.exp(gain[:, 0]) + gain[:, 1] * seen.opacity[:, None]
     person = batch.mattes > 0.98
-    return psnr_db(float(((seen - batch.targets)[person] ** 2).mean()))
+    return psnr_db(float(((colours - batch.targets)[person] ** 2).mean()))
 
 
 def _ray_source(

@@ -29,6 +29,7 @@ from ntop.field.kernels.tables import (
 MAX_SAMPLES = 512  # occupied samples kept per ray; at 4 mm that is 2 m of solid body
 ROBUST_WIDTH = 0.1  # colour errors beyond this count linearly (Charbonnier)
 MIN_SHADE = 0.02  # as in `shade`
+FAINT = 1e-3  # weight up to which a sample says nothing about the light
 
 
 @device
@@ -46,6 +47,92 @@ def densest_sheet(grid, warp, cell, fx, fy, fz, rows, weights):
                 if raw > best:
                     best, chosen = raw, sheet
     return best, chosen
+
+
+@device
+def next_dense(grid, warp, pose, ray, far, step, offset, sample, rows, weights):
+    """The first sample >= `sample` that the field reaches; see `next_sample`, `densest_sheet`.
+
+    Returns its number, its cell (-1: there is none), the place in it (3), raw density and sheet.
+    """
+    while True:
+        sample, cell, fx, fy, fz = next_sample(warp, pose, ray, far, step, offset, sample)
+        if cell < 0:
+            return sample, -1, fx, fy, fz, VOID_RAW, -1
+        raw, sheet = densest_sheet(grid, warp, cell, fx, fy, fz, rows, weights)
+        if sheet >= 0:
+            return sample, cell, fx, fy, fz, raw, sheet
+        sample += 1
+
+
+@device
+def albedo(grid, rows, weights):
+    """Red, green and blue of the surface at the point whose corners are given."""
+    return (
+        sigmoid(interpolate(grid, 1, rows, weights)),
+        sigmoid(interpolate(grid, 2, rows, weights)),
+        sigmoid(interpolate(grid, 3, rows, weights)),
+    )
+
+
+@device
+def channel_loss(colour, opacity, gain, bias, target, matte, back):
+    """Robust loss of one channel, its slope in the colour that is seen, and the error."""
+    seen = colour * math.exp(gain) + bias * opacity + (1 - opacity) * back
+    error = seen - (matte * target + (1 - matte) * back)
+    root = math.sqrt(error * error + ROBUST_WIDTH * ROBUST_WIDTH)
+    return root - ROBUST_WIDTH, error / root, error
+
+
+@device
+def sample_slopes(light, surface, normal, weight, after, behind, slopes, slope_opacity):
+    """Slopes of the loss in one sample's values.
+
+    Args:
+        light: (9, 3). surface: albedo (3). normal: (3). weight: of the sample.
+        after: transmittance behind the sample. behind: sum over later samples of their weight
+            times dL/dweight. slopes: dL/dC (3) of the field's colour. slope_opacity: dL/dA.
+
+    Returns:
+        dL/dtau, slopes of the three raw colours, and weight times dL/dweight.
+    """
+    nx, ny, nz = normal
+    shade0 = shade(light, 0, nx, ny, nz)
+    shade1 = shade(light, 1, nx, ny, nz)
+    shade2 = shade(light, 2, nx, ny, nz)
+    slope_weight = (
+        slopes[0] * surface[0] * shade0
+        + slopes[1] * surface[1] * shade1
+        + slopes[2] * surface[2] * shade2
+        + slope_opacity
+    )
+    return (
+        after * slope_weight - behind,
+        slopes[0] * weight * shade0 * surface[0] * (1 - surface[0]),
+        slopes[1] * weight * shade1 * surface[1] * (1 - surface[1]),
+        slopes[2] * weight * shade2 * surface[2] * (1 - surface[2]),
+        weight * slope_weight,
+    )
+
+
+@device
+def add_light_slopes(light, surface, normal, weight, slopes, light_slopes):
+    """Add a sample's slopes in the light to `light_slopes` (9, 3), unless it is too faint."""
+    if weight <= FAINT:
+        return
+    nx, ny, nz = normal
+    for channel in range(3):
+        slope = slopes[channel] * weight * surface[channel]
+        if shade(light, channel, nx, ny, nz) > MIN_SHADE:
+            light_slopes[0, channel] += slope
+            light_slopes[1, channel] += slope * nx
+            light_slopes[2, channel] += slope * ny
+            light_slopes[3, channel] += slope * nz
+            light_slopes[4, channel] += slope * nx * ny
+            light_slopes[5, channel] += slope * ny * nz
+            light_slopes[6, channel] += slope * (3 * nz * nz - 1)
+            light_slopes[7, channel] += slope * nx * nz
+            light_slopes[8, channel] += slope * (nx * nx - ny * ny)
 
 
 @kernel
@@ -78,8 +165,8 @@ def train_rays(
         weights = np.empty((2, 8), real)
         kept_rows = np.empty((MAX_SAMPLES, 8), np.int64)
         kept_weights = np.empty((MAX_SAMPLES, 8), real)
-        kept = np.empty((MAX_SAMPLES, 12), np.float64)
-        # columns: d tau / d raw, tau, weight, T after, albedo (3), normal (3), -, -
+        # columns: d tau / d raw, weight, T after, albedo (3), normal (3)
+        kept = np.empty((MAX_SAMPLES, 9), np.float64)
         for r in range(block * count // blocks, (block + 1) * count // blocks):
             ray, near, far = start_ray(warp, poses[r], origins[r], directions[r])
             sample = max(0, int(math.ceil(near / step - offsets[r])))
@@ -87,88 +174,63 @@ def train_rays(
             thickness, transmittance = 0.0, 1.0
             red = green = blue = 0.0
             while transmittance >= stop and samples < MAX_SAMPLES:
-                sample, cell, fx, fy, fz = next_sample(
-                    warp, poses[r], ray, far, step, offsets[r], sample
+                sample, cell, fx, fy, fz, raw, sheet = next_dense(
+                    grid, warp, poses[r], ray, far, step, offsets[r], sample, rows, weights
                 )
                 if cell < 0:
                     break
-                raw, sheet = densest_sheet(grid, warp, cell, fx, fy, fz, rows, weights)
-                if sheet >= 0:
-                    tau = DENSITY_SCALE * softplus(raw) * step
-                    weight = transmittance * -math.expm1(-tau)
-                    thickness += tau
-                    transmittance = math.exp(-thickness)
-                    keep = kept[samples]
-                    for c in range(8):
-                        kept_rows[samples, c] = rows[sheet, c]
-                        kept_weights[samples, c] = weights[sheet, c]
-                    keep[0] = DENSITY_SCALE * sigmoid(raw) * step
-                    keep[1], keep[2], keep[3] = tau, weight, transmittance
-                    nx, ny, nz = surface_normal(warp, cell, sheet, fx, fy, fz)
-                    keep[7], keep[8], keep[9] = nx, ny, nz
-                    for channel in range(3):
-                        keep[4 + channel] = sigmoid(
-                            interpolate(grid, 1 + channel, rows[sheet], weights[sheet])
-                        )
-                    red += weight * keep[4] * shade(light, 0, nx, ny, nz)
-                    green += weight * keep[5] * shade(light, 1, nx, ny, nz)
-                    blue += weight * keep[6] * shade(light, 2, nx, ny, nz)
-                    samples += 1
+                tau = DENSITY_SCALE * softplus(raw) * step
+                weight = transmittance * -math.expm1(-tau)
+                thickness += tau
+                transmittance = math.exp(-thickness)
+                keep = kept[samples]
+                for c in range(8):
+                    kept_rows[samples, c] = rows[sheet, c]
+                    kept_weights[samples, c] = weights[sheet, c]
+                keep[0] = DENSITY_SCALE * sigmoid(raw) * step
+                keep[1], keep[2] = weight, transmittance
+                keep[3], keep[4], keep[5] = albedo(grid, rows[sheet], weights[sheet])
+                nx, ny, nz = surface_normal(warp, cell, sheet, fx, fy, fz)
+                keep[6], keep[7], keep[8] = nx, ny, nz
+                red += weight * keep[3] * shade(light, 0, nx, ny, nz)
+                green += weight * keep[4] * shade(light, 1, nx, ny, nz)
+                blue += weight * keep[5] * shade(light, 2, nx, ny, nz)
+                samples += 1
                 sample += 1
 
+            # loss and its derivatives
             opacity = 1 - transmittance
             matte, camera = mattes[r], cameras[r]
-            # loss and its derivatives
-            gain = camera_gain[camera]
-            back = backgrounds[r]
-            scales = (math.exp(gain[0, 0]), math.exp(gain[0, 1]), math.exp(gain[0, 2]))
-            field = (red, green, blue)
-            g0 = g1 = g2 = 0.0
-            slope_opacity = matte_weights[r] * 2 * (opacity - matte)
+            gain, back = camera_gain[camera], backgrounds[r]
             losses[block, 2] += matte_weights[r] * (opacity - matte) ** 2
+            slope_opacity = matte_weights[r] * 2 * (opacity - matte)
             slope_opacity += entropy_weight * (1 - 2 * opacity)
+            colour, slopes = (red, green, blue), (0.0, 0.0, 0.0)
             for channel in range(3):
-                premultiplied = field[channel] * scales[channel] + gain[1, channel] * opacity
-                seen = premultiplied + transmittance * back[channel]
-                wanted = matte * targets[r, channel] + (1 - matte) * back[channel]
-                error = seen - wanted
-                root = math.sqrt(error * error + ROBUST_WIDTH * ROBUST_WIDTH)
-                losses[block, 0] += colour_weights[r] * (root - ROBUST_WIDTH)
+                loss, slope, error = channel_loss(
+                    colour[channel], opacity, gain[0, channel], gain[1, channel],
+                    targets[r, channel], matte, back[channel],
+                )  # fmt: skip
+                losses[block, 0] += colour_weights[r] * loss
                 if matte > 0.5:
                     losses[block, 1] += error * error
-                slope = colour_weights[r] * error / root
-                gain_gradients[block, camera, 0, channel] += (
-                    slope * field[channel] * scales[channel]
-                )
+                slope *= colour_weights[r]
+                scale = math.exp(gain[0, channel])
+                gain_gradients[block, camera, 0, channel] += slope * colour[channel] * scale
                 gain_gradients[block, camera, 1, channel] += slope * opacity
                 # d seen / d opacity beside the weights' own colours
                 slope_opacity += slope * (gain[1, channel] - back[channel])
-                if channel == 0:
-                    g0 = slope * scales[0]
-                elif channel == 1:
-                    g1 = slope * scales[1]
-                else:
-                    g2 = slope * scales[2]
+                slopes = (slopes[1], slopes[2], slope * scale)
 
             behind = 0.0  # sum over later samples of weight * dL/dweight
             for s in range(samples - 1, -1, -1):
                 keep = kept[s]
-                nx, ny, nz = keep[7], keep[8], keep[9]
-                shade0 = shade(light, 0, nx, ny, nz)
-                shade1 = shade(light, 1, nx, ny, nz)
-                shade2 = shade(light, 2, nx, ny, nz)
-                weight = keep[2]
-                slope_weight = (
-                    g0 * keep[4] * shade0
-                    + g1 * keep[5] * shade1
-                    + g2 * keep[6] * shade2
-                    + slope_opacity
+                surface, normal = (keep[3], keep[4], keep[5]), (keep[6], keep[7], keep[8])
+                slope_tau, slope0, slope1, slope2, own = sample_slopes(
+                    light, surface, normal, keep[1], keep[2], behind, slopes, slope_opacity
                 )
-                slope_raw = (keep[3] * slope_weight - behind) * keep[0]
-                behind += weight * slope_weight
-                slope0 = g0 * weight * shade0 * keep[4] * (1 - keep[4])
-                slope1 = g1 * weight * shade1 * keep[5] * (1 - keep[5])
-                slope2 = g2 * weight * shade2 * keep[6] * (1 - keep[6])
+                behind += own
+                slope_raw = slope_tau * keep[0]
                 for c in range(8):
                     row, share = kept_rows[s, c], kept_weights[s, c]
                     gradients[block, row, 0] += share * slope_raw
@@ -176,17 +238,4 @@ def train_rays(
                     gradients[block, row, 2] += share * slope1
                     gradients[block, row, 3] += share * slope2
                     touched[block, row >> 6] = 1
-                if weight > 1e-3:
-                    for channel in range(3):
-                        slope = (g0, g1, g2)[channel] * weight * keep[4 + channel]
-                        if shade(light, channel, nx, ny, nz) > MIN_SHADE:
-                            row_light = light_gradients[block]
-                            row_light[0, channel] += slope
-                            row_light[1, channel] += slope * nx
-                            row_light[2, channel] += slope * ny
-                            row_light[3, channel] += slope * nz
-                            row_light[4, channel] += slope * nx * ny
-                            row_light[5, channel] += slope * ny * nz
-                            row_light[6, channel] += slope * (3 * nz * nz - 1)
-                            row_light[7, channel] += slope * nx * nz
-                            row_light[8, channel] += slope * (nx * nx - ny * ny)
+                add_light_slopes(light, surface, normal, keep[1], slopes, light_gradients[block])

@@ -23,6 +23,34 @@ def neighbour_row(bricks, position, i, j, k):
     return slot * 64 + (((x & 3) << 4) | ((y & 3) << 2) | (z & 3))
 
 
+@device
+def add_priors(
+    values, bricks, positions, slot, node, smoothness, edge, anchors, anchor_weight, gradient
+):  # fmt: skip
+    """Add the priors' slopes in one node's values to `gradient` (4,); arguments as of `gather`."""
+    row = slot * 64 + node
+    off = values[row, 0] - anchors[row]
+    gradient[0] += anchor_weight * off / math.sqrt(off * off + edge[0] ** 2)
+    for n in range(6):
+        dx, dy, dz = NEIGHBOURS[n]
+        other = neighbour_row(
+            bricks, positions[slot], (node >> 4) + dx, ((node >> 2) & 3) + dy, (node & 3) + dz
+        )
+        if other >= 0:
+            for channel in range(4):
+                d = values[row, channel] - values[other, channel]
+                gradient[channel] += smoothness[channel] * d / math.sqrt(d * d + edge[channel] ** 2)
+
+
+@device
+def adam_value(value, gradient, mean, square, corrections, rate, beta1, beta2, low, high):
+    """One value after an Adam step, and its moments; `corrections` are 1 - beta ** steps."""
+    mean = beta1 * mean + (1 - beta1) * gradient
+    square = beta2 * square + (1 - beta2) * gradient * gradient
+    move = rate * (mean / corrections[0]) / (math.sqrt(square / corrections[1]) + 1e-10)
+    return min(max(value - move, low), high), mean, square
+
+
 @kernel
 def gather(
     values, bricks, positions, active, gradients, touched, smoothness, edge, anchors, anchor_weight
@@ -50,23 +78,11 @@ def gather(
                         gradients[b, row, channel] = 0
             touched[b, slot] = 0
         touched[0, slot] = 0
-        for i in range(4):
-            for j in range(4):
-                for k in range(4):
-                    row = slot * 64 + ((i << 4) | (j << 2) | k)
-                    off = values[row, 0] - anchors[row]
-                    gradients[0, row, 0] += (
-                        anchor_weight * off / math.sqrt(off * off + edge[0] ** 2)
-                    )
-                    for n in range(6):
-                        dx, dy, dz = NEIGHBOURS[n]
-                        other = neighbour_row(bricks, positions[slot], i + dx, j + dy, k + dz)
-                        if other >= 0:
-                            for channel in range(4):
-                                d = values[row, channel] - values[other, channel]
-                                gradients[0, row, channel] += (
-                                    smoothness[channel] * d / math.sqrt(d * d + edge[channel] ** 2)
-                                )
+        for node in range(64):
+            add_priors(
+                values, bricks, positions, slot, node, smoothness, edge, anchors, anchor_weight,
+                gradients[0, slot * 64 + node],
+            )  # fmt: skip
 
 
 @kernel
@@ -83,15 +99,12 @@ def adam_step(values, active, gradients, first, second, counts, rates, beta1, be
     for a in numba.prange(active.shape[0]):
         slot = active[a]
         counts[slot] += 1
-        correct1 = 1 - beta1 ** counts[slot]
-        correct2 = 1 - beta2 ** counts[slot]
+        corrections = (1 - beta1 ** counts[slot], 1 - beta2 ** counts[slot])
         for row in range(slot * 64, slot * 64 + 64):
             for channel in range(4):
                 g = gradients[0, row, channel]
                 gradients[0, row, channel] = 0
-                m = beta1 * first[row, channel] + (1 - beta1) * g
-                v = beta2 * second[row, channel] + (1 - beta2) * g * g
-                first[row, channel], second[row, channel] = m, v
-                move = rates[channel] * (m / correct1) / (math.sqrt(v / correct2) + 1e-10)
-                new = values[row, channel] - move
-                values[row, channel] = min(max(new, low[channel]), high[channel])
+                values[row, channel], first[row, channel], second[row, channel] = adam_value(
+                    values[row, channel], g, first[row, channel], second[row, channel],
+                    corrections, rates[channel], beta1, beta2, low[channel], high[channel],
+                )  # fmt: skip

@@ -34,7 +34,7 @@ def kernel_device() -> KernelDevice:
         return KernelDevice(gpu=False, reason=_idle(visible, "numba has no CUDA here"))
     if not cuda.is_available():
         return KernelDevice(gpu=False, reason=_idle(visible, "CUDA finds no driver or no GPU"))
-    name = getattr(cuda.get_current_device(), "name", "simulator")
+    name = getattr(cuda.current_context().device, "name", "the simulator")
     return KernelDevice(gpu=True, name=name.decode() if isinstance(name, bytes) else name)
 
 

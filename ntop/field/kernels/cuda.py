@@ -4,7 +4,7 @@ The arithmetic is that of the CPU's kernels, function for function: numba compil
 for the GPU. What differs is memory. A CPU's ray keeps its samples until it walks back; a GPU's ray
 keeps nothing and walks twice, as the sum over later samples is the whole sum, known after the first
 walk, less that over earlier ones. And where the CPU adds up blocks in order, the GPU adds whole
-numbers, which give the same sum in any order (docs/decisions/0018-gpu-kernels.md).
+numbers, which give the same sum in any order (docs/decisions/0019-gpu-kernels.md).
 
 Import this module only where a GPU is used; NUMBA_ENABLE_CUDASIM=1 stands in for one in tests.
 """

@@ -7,7 +7,7 @@ CORES ?= 2
 BIN := $(abspath $(VENV))/bin
 RUN := PATH="$(BIN):$$PATH"
 
-.PHONY: env demo studio test lint bench bench-field bench-scale numerics chaos rulegraph
+.PHONY: env demo studio test lint bench bench-field bench-gpu bench-scale numerics chaos rulegraph
 
 env: $(VENV)/.ready
 
@@ -68,6 +68,14 @@ bench: env
 # quality over training time, grid and twin; hours on an idle machine, BENCH=--quick is a smoke test
 bench-field: env
 	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.field $(BENCH)
+
+# training and rendering on an NVIDIA GPU, a few minutes; PARTS="launches views" for some parts only
+bench-gpu: env
+	@command -v nvidia-smi > /dev/null || { echo "ntop: bench-gpu needs an NVIDIA GPU and its \
+	  driver, and this machine has no nvidia-smi"; exit 1; }
+	@$(BIN)/python -c 'import numba_cuda' 2> /dev/null || \
+	  $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cuda]'
+	$(RUN) python -m benchmarks.gpu $(PARTS)
 
 rulegraph: env
 	$(RUN) scripts/draw_rulegraph.sh

@@ -58,31 +58,44 @@ def _launch(kernel: Any, count: int, *arguments: Any) -> None:
 _SCENE = Uploads()  # an avatar is sent once, a pose once for all its views
 
 
-def march_on_gpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
-    """As `ntop.field.marching.march_rays`: all rays in one launch.
+class ReadyMarch:
+    """A march whose rays are on the GPU; one launch for all of them.
 
-    Beside the scene, a launch holds 32 bytes of input per ray (24 more with an origin per ray, 8
-    with a pose per ray) and 21 bytes of output.
+    Beside the scene it holds 32 bytes of input per ray (24 more with an origin per ray, 8 with a
+    pose per ray) and 21 bytes of output.
     """
-    count = len(rays.directions)
-    colours, opacity = cuda.device_array((count, 3), np.float32), _floats(count)
-    depth, parts = _floats(count), cuda.device_array(count, np.uint8)
-    evaluations = _zeros(1)
-    _launch(
-        march_rays, count, _SCENE.tables(scene.grid), _SCENE.tables(scene.warp),
-        _SCENE.array("light", scene.light), _SCENE.array("labels", scene.labels.values),
-        _SCENE.array("labels_origin", scene.labels.origin), 1 / scene.labels.spacing_m,
-        _sent(rays.poses), _sent(rays.origins), _sent(rays.directions), _sent(rays.offsets), *rule,
-        colours, opacity, depth, parts, evaluations,
-    )  # fmt: skip
-    return Seen(
-        colours.copy_to_host(), opacity.copy_to_host(), depth.copy_to_host(), parts.copy_to_host(),
-        int(evaluations.copy_to_host()[0]),
-    )  # fmt: skip
+
+    def __init__(self, scene: Scene, rays: Rays, rule: MarchRule) -> None:
+        """Send what is not there yet."""
+        count = len(rays.directions)
+        self._outputs = (
+            cuda.device_array((count, 3), np.float32), cuda.device_array(count, np.float32),
+            cuda.device_array(count, np.float32), cuda.device_array(count, np.uint8),
+        )  # fmt: skip
+        self._evaluations = _zeros(1)
+        self._arguments = (
+            _SCENE.tables(scene.grid), _SCENE.tables(scene.warp),
+            _SCENE.array("light", scene.light), _SCENE.array("labels", scene.labels.values),
+            _SCENE.array("labels_origin", scene.labels.origin), 1 / scene.labels.spacing_m,
+            *(_sent(array) for array in rays), *rule, *self._outputs, self._evaluations,
+        )  # fmt: skip
+        self._count = count
+
+    def launch(self) -> None:
+        """Start it; returns at once."""
+        _launch(march_rays, self._count, *self._arguments)
+
+    def fetch(self) -> Seen:
+        """What was seen, after all launches."""
+        evaluations = int(self._evaluations.copy_to_host()[0])
+        return Seen(*(array.copy_to_host() for array in self._outputs), evaluations)
 
 
-def _floats(count: int) -> Any:
-    return cuda.device_array(count, np.float32)
+def march_on_gpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
+    """As `ntop.field.marching.march_rays`."""
+    march = ReadyMarch(scene, rays, rule)
+    march.launch()
+    return march.fetch()
 
 
 class GpuLearner:

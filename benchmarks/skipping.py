@@ -21,7 +21,7 @@ from ntop.field.rendering import RenderSettings, body_pixels, render_view
 from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import resized
 
-SIDE_PX = 250
+SIDE_PX = 160
 ON = RenderSettings(edge_rays=1)
 LEVELS = {  # level -> settings without it
     "pixels": replace(ON, crop=False),

@@ -90,7 +90,8 @@ def test_17_a_homogeneous_sphere_has_the_opacity_of_its_chord(margin):
     tau[:, -1] = density * 1e10
     endless = composed(tau, np.ones((*tau.shape, 3))).opacity.numpy()
     margin.mutant_exceeds("last interval 1e10 long", np.abs(endless - truth).max(), 1e-6)
-    # unclipped: the same ball as a jump between two nodes, which steps do not resolve
+    # unclipped: the same ball as a jump between two nodes, which no step resolves; rays are cut at
+    # the faces of voxels, so the error does not grow with the step
     middle = np.full(3, 0.06)
     posed = posed_field(
         lambda p: np.where(
@@ -105,13 +106,13 @@ def test_17_a_homogeneous_sphere_has_the_opacity_of_its_chord(margin):
         rms(trace_rays(posed, centre, directions, settings=exact(step)).alpha - fine)
         for step in (0.016, 0.008, 0.004)
     ]
-    margin.at_least("unclipped, order", order(errors), 0.9)
+    margin.at_most("unclipped, any step", max(errors), 1e-3)
 
 
 WIDTH_M, BLOB_DEPTH = 0.04, 2.0  # a Gaussian blob and its optical depth through the middle
 
 
-def blob_scene():
+def blob_scene(voxel_m=0.001):
     """A thin column through a Gaussian blob; its colour changes along the way."""
     size = (0.024, 0.024, 0.424)
     middle = np.array(size) / 2
@@ -122,7 +123,10 @@ def blob_scene():
         return raw_of(peak * np.exp(-squared / (2 * WIDTH_M**2)))
 
     posed = posed_field(
-        raw, size_m=size, voxel_m=0.001, colour=lambda p: np.repeat(20 * (p - middle)[:, 2:], 3, 1)
+        raw,
+        size_m=size,
+        voxel_m=voxel_m,
+        colour=lambda p: np.repeat(20 * (p - middle)[:, 2:], 3, 1),
     )
     return posed, middle, peak
 
@@ -148,12 +152,15 @@ def test_18_a_gaussian_blob_converges_with_the_second_order(margin):
     seen = trace_rays(posed, centre, directions, settings=exact(DEFAULT_STEP_M))
     margin.at_most("alpha at the default step", np.abs(seen.alpha - alpha).max(), 1e-4)
     margin.at_most("colour at the default step", np.abs(seen.rgb[:, 0] - colour).max(), 1e-4)
+    # between the faces of voxels, so in large ones
+    posed, middle, _ = blob_scene(voxel_m=0.064)
     fine = trace_rays(posed, centre, directions, settings=exact(0.0005)).rgb
     errors = [
         rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb - fine)
-        for step in (0.032, 0.016, 0.008)
+        for step in (0.004, 0.002, 0.001)
     ]
-    margin.at_least("order of the rule", order(errors), 1.9)
+    # the rule's order is 2; faces of octants, which do not move with the step, hide a part of it
+    margin.at_least("order of the rule", order(errors), 1.8)
 
 
 def slab_rule(rule, samples, *, start=0.0):
@@ -242,7 +249,8 @@ def test_19_a_soft_slab_converges_and_two_densities_beat_one(margin):
         rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb[:, 0] - truth)
         for step in (0.016, 0.008, 0.004)
     ]
-    margin.at_least("order of the renderer", order(errors), 1.9)
+    # a piece never reaches over a face of a voxel, so steps longer than a voxel cost nothing
+    margin.at_most("colour at any step", max(errors), 1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

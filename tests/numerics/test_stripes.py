@@ -72,7 +72,8 @@ def test_25_half_the_difference_measures_the_error(margin, person, lens):
     reference = render_view(posed, camera, settings=fine).rgb
     error = (seen.first - reference)[seen.mask]
     wave = 255 * float((error - error.mean(0)).std())
-    margin.at_least(f"self-test over error, {lens}", seen.scores.phase_rms / wave, 0.6)
+    # rays are cut at faces of voxels as well, and what that leaves has no phase
+    margin.at_least(f"self-test over error, {lens}", seen.scores.phase_rms / wave, 0.5)
     margin.at_most(f"self-test over error, {lens}", seen.scores.phase_rms / wave, 1.4)
 
 

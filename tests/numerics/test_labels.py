@@ -85,7 +85,7 @@ def annotated_views(inputs: Path, out: Path, *, size: tuple[int, int], rig: str)
 
 def blob_errors(rows: list[Row]) -> np.ndarray:
     """Distances of all views and joints (px)."""
-    dataset = Dataset(Path(), tuple(rows))
+    dataset = Dataset(Path(), tuple(rows), len(rows), 1)
     (key,) = dataset.sets
     return np.array(list(blob_errors_px(dataset, key).values()))
 

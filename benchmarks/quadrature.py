@@ -34,7 +34,7 @@ from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import resized
 from ntop.metrics.stripes import MAX_AMPLITUDE, MAX_Z, lock_in
 
-RAYS_PER_VIEW = 3000
+RAYS_PER_VIEW = 1000
 VIEWS = ("centre", "e", "nw")
 ROUNDS = 7
 MAX_RMS, MAX_P999 = 0.5, 1.0  # grey levels

@@ -123,7 +123,8 @@ def write_checkpoint(arrays: dict[str, np.ndarray], header: dict[str, Any], path
             os.fsync(stream.fileno())
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        if path.parent.is_dir():
+            temporary.unlink(missing_ok=True)
         raise DataError(
             f"cannot write checkpoint {path}: {error.strerror or error}; check the folder's "
             "permissions and the free space, then run the same command again"

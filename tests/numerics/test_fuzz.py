@@ -30,6 +30,7 @@ from ntop.field.canonical import (
     initial_grid,
     label_grid,
 )
+from ntop.field.kernels.posing import MAX_STRETCH
 from ntop.field.kernels.tables import EMPTY_RAW
 from ntop.field.rendering import PosedAvatar, Rendering, RenderSettings, render_view
 from ntop.field.warp import MAX_NODES, occupied, pose_warp
@@ -193,9 +194,14 @@ def finite_or_refused(make_lens, center, turn, pose, kind, step_m, edge_rays):
         OUTCOMES["refused"] += 1
         return
     tables = avatar.warp.tables
-    diagonal_m = float(np.linalg.norm(tables.dims[0])) * avatar.warp.cell_m
+    # a ray crosses at most so many octants; in each, the faces of voxels on the way of either sheet
+    # and the nodes of the lattice cut it into pieces: a look-up of the voxel, two densities a sheet
+    octants = 2 * int(tables.dims[0].sum()) + 3
+    faces = 3 * (MAX_STRETCH * avatar.warp.cell_m / avatar.grid.voxel_m + 1)
+    length_m = float(np.linalg.norm(tables.dims[0])) * avatar.warp.cell_m
+    pieces = octants * (2 * faces + 1) + length_m / step_m
     rays = lens.width * lens.height * (1 + (4 if edge_rays > 1 else 0))
-    assert rendering.evaluations <= rays * (diagonal_m / step_m + 2)
+    assert rendering.evaluations <= 5 * rays * pieces
     check_view(rendering, camera, columns)
     OUTCOMES["seen" if rendering.alpha.any() else "unseen"] += 1
 

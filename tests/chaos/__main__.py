@@ -7,13 +7,14 @@ A piece of a long campaign is written to a JSON file; `--merge` puts pieces toge
 
 import argparse
 import json
+import random
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from tests.chaos.catalogue import QUICK, SLOW, deal, lacking
+from tests.chaos.catalogue import QUICK, SLOW, deal, find, lacking
 from tests.chaos.slurm import SLURM_KINDS, slurm_trials
 from tests.chaos.table import write_table
 from tests.chaos.trial import NOT_TRIED, Outcome, run_trial
@@ -28,6 +29,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="trials at a time")
     parser.add_argument("--finished", type=Path, help="a finished tiny campaign, else one is run")
     parser.add_argument("--out", type=Path, default=Path("docs/chaos"))
+    parser.add_argument("--only", nargs="*", default=[], help="these alone, as NAME:STAGE")
     parser.add_argument("--merge", type=Path, nargs="*", default=[], help="JSON of earlier pieces")
     options = parser.parse_args()
     for kind in [*QUICK, *SLOW]:
@@ -67,7 +69,12 @@ def campaign(options: argparse.Namespace, finished: Project | None, place: Path)
     if finished is None:
         return []
     num_slurm = min(len(SLURM_KINDS), options.trials // 10) if slurm_is_installed() else 0
-    deck = deal(options.trials - num_slurm, options.seed)
+    if options.only:
+        num_slurm, kinds = 0, [find(*name.split(":")) for name in options.only]
+        chance = random.Random(options.seed)
+        deck = [(kind, chance.randrange(2**31)) for kind in kinds]
+    else:
+        deck = deal(options.trials - num_slurm, options.seed)
 
     def attempt(numbered: tuple[int, tuple]) -> Outcome:
         number, (kind, seed) = numbered

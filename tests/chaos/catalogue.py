@@ -119,8 +119,8 @@ SLOW = [
     Kind("truncate a Parquet", "train", damaged_result(truncate, CAPTURED, "*.parquet",
                                                        rerun="train")),
     Kind("fill the disk", "train", full_disk("train", "results/work/4_train", (16, 900)), "mount"),
-    Kind("restore with wrong times", "annotate", moved_in_time(-400)),
-    Kind("restore with wrong times", "annotate", moved_in_time(2)),
+    Kind("restore with old times", "annotate", moved_in_time(-400)),
+    Kind("restore with future times", "annotate", moved_in_time(2)),
     Kind("a second worker on one actor", "train", duplicate_worker("train")),
 ]  # fmt: skip
 

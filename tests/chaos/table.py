@@ -18,6 +18,18 @@ was damaged, an error (or `ntop check`) named it and what to do.
 Moments follow from progress (a process seen, sets finished) and the seed; a trial that comes too
 late is repeated. `make chaos TRIALS=60 SEED=1` makes this page; a dozen of the trials are part of
 `make test`.
+
+What earlier campaigns found, and what has been mended since, each with its trial above or below:
+
+| found | now |
+|---|---|
+| a changed byte of a checkpoint went on into another avatar | checkpoints carry a SHA-256 |
+| a picture of a finished shard, changed without a change of its size, went into the dataset | assemble compares every picture with its record |
+| depth and part images of a dataset had no checksum | `files.parquet` has those of all files |
+| "delete it and rerun the stage" left Snakemake idle: the folder was still there | errors say `--forcerun OUTPUT` |
+| a read-only folder ended in Snakemake's traceback, without a remedy | `workflow/run.sh` adds it |
+| results from the future (a clock that was wrong) stopped every later run | `workflow/run.sh` prints the line that sets their times |
+| a full disk ended assemble in a traceback | the error names the file, the disk and the remedy |
 """
 
 

@@ -19,18 +19,39 @@ Moments follow from progress (a process seen, sets finished) and the seed; a tri
 late is repeated. `make chaos TRIALS=60 SEED=1` makes this page; a dozen of the trials are part of
 `make test`.
 
-What earlier campaigns found, and what has been mended since, each with its trial above or below:
+What the suite has found, by its trials or while they were written, and what was mended since:
 
 | found | now |
 |---|---|
-| a changed byte of a checkpoint went on into another avatar | checkpoints carry a SHA-256 |
-| a picture of a finished shard, changed without a change of its size, went into the dataset | assemble compares every picture with its record |
-| depth and part images of a dataset had no checksum | `files.parquet` has those of all files |
-| "delete it and rerun the stage" left Snakemake idle: the folder was still there | errors say `--forcerun OUTPUT` |
-| a read-only folder ended in Snakemake's traceback, without a remedy | `workflow/run.sh` adds it |
-| results from the future (a clock that was wrong) stopped every later run | `workflow/run.sh` prints the line that sets their times |
-| a full disk ended assemble in a traceback | the error names the file, the disk and the remedy |
 """
+
+FOUND = [
+    ("a changed byte of a checkpoint went on into another avatar", "checkpoints carry a SHA-256"),
+    (
+        "a picture that changed after its annotation, though not in size, went into the dataset",
+        "assemble compares every picture with the shard's record",
+    ),
+    (
+        "depth and part images of a dataset had no checksum",
+        "`files.parquet` has those of all files, `ntop check` compares",
+    ),
+    (
+        'advice as "delete it and rerun the stage" left Snakemake idle: the folder was still there',
+        "errors say `--forcerun OUTPUT`",
+    ),
+    (
+        "a read-only folder ended in Snakemake's traceback, without a remedy",
+        "`workflow/run.sh` adds it",
+    ),
+    (
+        "results from the future, of a clock that was wrong, stopped every later run",
+        "`workflow/run.sh` prints the line that sets their times",
+    ),
+    (
+        "a full disk ended assemble in a traceback",
+        "the error names the file, the disk and the remedy",
+    ),
+]
 
 
 def write_table(outcomes: list[Outcome], out: Path) -> None:
@@ -40,7 +61,8 @@ def write_table(outcomes: list[Outcome], out: Path) -> None:
     survived = sum(outcome.survived for outcome in outcomes)
     kinds = Counter(outcome.disturbance for outcome in outcomes)
     lines = [
-        HEAD,
+        HEAD + "\n".join(f"| {found} | {now} |" for found, now in FOUND),
+        "",
         f"**{survived} of {len(outcomes)} trials survived**, {len(kinds)} kinds of disturbance.",
         "Seconds are those of the user's commands after the disturbance, on a busy machine.",
         "",

@@ -40,7 +40,20 @@ def clone(folder: Path, executed: Path) -> None:
         else:
             renders = pq.read_table(folder / "results/5_render" / job.key / "renders.parquet")
             table = pq.read_table(old)
+            persons = of_person(table["persons"].combine_chunks(), key[1])
+            table = table.set_column(table.schema.get_field_index("persons"), "persons", persons)
             write(table.set_column(0, "sample_id", renders["sample_id"]), new)
+
+
+def of_person(persons: pa.ListArray, name: str) -> pa.ListArray:
+    """The persons of some views under another name."""
+    fields = list(persons.values.type)
+    columns = [
+        pa.array([name] * len(persons.values)) if field.name == "person_id" else column
+        for field, column in zip(fields, persons.values.flatten(), strict=True)
+    ]
+    values = pa.StructArray.from_arrays(columns, fields=fields)
+    return pa.ListArray.from_arrays(persons.offsets, values, type=persons.type)
 
 
 def clone_folder(old: Path, new: Path, names: dict[str, str]) -> None:

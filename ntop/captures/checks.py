@@ -69,7 +69,7 @@ def check_rig(cameras: dict[str, Camera], *, where: str) -> None:
     Mirrored or inverted extrinsics put that place behind some of them.
     """
     for view, camera in cameras.items():
-        if not (camera.center_world.isfinite().all() and camera.center_world[2] > 0):
+        if not camera.center_world[2] > 0:
             raise DataError(
                 f"{where} camera {view}: centre {camera.center_world.tolist()} m is not above the "
                 "floor z = 0; the source's up axis, origin or unit was read wrongly"

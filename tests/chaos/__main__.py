@@ -10,6 +10,7 @@ import json
 import random
 import sys
 import tempfile
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 from tests.chaos.catalogue import QUICK, SLOW, deal, find, lacking
 from tests.chaos.slurm import SLURM_KINDS, slurm_trials
 from tests.chaos.table import write_table
-from tests.chaos.trial import NOT_TRIED, Outcome, run_trial
+from tests.chaos.trial import NOT_TRIED, Kind, Outcome, run_trial
 from tests.slurm.cluster import slurm_is_installed
 from tests.workflow.project import Project
 
@@ -30,6 +31,7 @@ def main() -> int:
     parser.add_argument("--finished", type=Path, help="a finished tiny campaign, else one is run")
     parser.add_argument("--out", type=Path, default=Path("docs/chaos"))
     parser.add_argument("--only", nargs="*", default=[], help="these alone, as NAME:STAGE")
+    parser.add_argument("--slurm", type=int, help="trials through SLURM, else a tenth of them")
     parser.add_argument("--merge", type=Path, nargs="*", default=[], help="JSON of earlier pieces")
     options = parser.parse_args()
     for kind in [*QUICK, *SLOW]:
@@ -65,27 +67,43 @@ def reference(folder: Path | None, place: Path) -> Project:
 
 
 def campaign(options: argparse.Namespace, finished: Project | None, place: Path) -> list[Outcome]:
-    """All trials of this call, in the order of their numbers."""
+    """All trials of this call, in the order of their numbers; each is kept once it is over."""
     if finished is None:
         return []
-    num_slurm = min(len(SLURM_KINDS), options.trials // 10) if slurm_is_installed() else 0
-    if options.only:
-        num_slurm, kinds = 0, [find(*name.split(":")) for name in options.only]
-        chance = random.Random(options.seed)
-        deck = [(kind, chance.randrange(2**31)) for kind in kinds]
-    else:
-        deck = deal(options.trials - num_slurm, options.seed)
+    num_slurm, deck = dealt(options)
+    outcomes: list[Outcome] = []
+    kept = threading.Lock()
 
-    def attempt(numbered: tuple[int, tuple]) -> Outcome:
-        number, (kind, seed) = numbered
-        outcome = run_trial(number, kind, seed, finished=finished, place=place)
-        print(json.dumps(asdict(outcome)), flush=True)
-        return outcome
+    def keep(outcome: Outcome) -> None:
+        with kept:
+            outcomes.append(outcome)
+            outcomes.sort(key=lambda other: other.number)
+            write_table(outcomes, options.out)
+            print(json.dumps(asdict(outcome)), flush=True)
+
+    def attempt(number: int, kind: Kind, seed: int) -> None:
+        keep(run_trial(number, kind, seed, finished=finished, place=place))
 
     with ThreadPoolExecutor(options.jobs) as pool:
-        outcomes = list(pool.map(attempt, enumerate(deck, start=1)))
-    first = len(deck) + 1
-    return outcomes + slurm_trials(num_slurm, options.seed, first, finished=finished, place=place)
+        waiting = [pool.submit(attempt, n, *drawn) for n, drawn in enumerate(deck, start=1)]
+        for trial in waiting:
+            trial.result()
+    kinds = SLURM_KINDS[:num_slurm]
+    for outcome in slurm_trials(kinds, options.seed, len(deck) + 1, finished=finished, place=place):
+        keep(outcome)
+    return outcomes
+
+
+def dealt(options: argparse.Namespace) -> tuple[int, list[tuple[Kind, int]]]:
+    """How many trials go through SLURM, and the other disturbances with their seeds."""
+    if options.only:
+        chance = random.Random(options.seed)
+        return options.slurm or 0, [
+            (find(*name.split(":")), chance.randrange(2**31)) for name in options.only
+        ]
+    num_slurm = min(len(SLURM_KINDS), options.trials // 10) if slurm_is_installed() else 0
+    num_slurm = num_slurm if options.slurm is None else options.slurm
+    return num_slurm, deal(options.trials - num_slurm, options.seed)
 
 
 if __name__ == "__main__":

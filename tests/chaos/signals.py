@@ -12,7 +12,7 @@ import psutil
 
 from ntop.storage.work import EXIT_TERMINATED
 from tests.chaos.trial import DefeatError, Hit, Strike
-from tests.chaos.workspace import WORK, TooLateError, Workspace
+from tests.chaos.workspace import PATIENCE_S, WORK, TooLateError, Workspace
 
 # seconds of an undisturbed job on an idle core: the range of random moments
 LASTS_S = {
@@ -141,7 +141,7 @@ def terminate_cleanly(stage: str) -> Strike:
             time.sleep(0.02)
         time.sleep(chance.uniform(0, 0.5))
         alone.send_signal(signal.SIGTERM)
-        said = alone.communicate(timeout=900)[1]
+        said = alone.communicate(timeout=PATIENCE_S)[1]
         if alone.returncode in {0, -signal.SIGTERM}:
             raise TooLateError("it had just finished, or not yet begun")
         if alone.returncode != EXIT_TERMINATED or len(pieces(content)) < before:
@@ -176,4 +176,4 @@ def gone_is_too_late():
 
 def wait_for_end(space: Workspace) -> int:
     """The exit code of the disturbed run."""
-    return space.heads[-1].wait(timeout=900)
+    return space.heads[-1].wait(timeout=PATIENCE_S)

@@ -4,11 +4,11 @@ import random
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tests.chaos.trial import DefeatError, Hit, Outcome, difference
-from tests.chaos.workspace import OUTPUTS, WORK, Workspace
+from tests.chaos.workspace import OUTPUTS, PATIENCE_S, WORK, Workspace
 from tests.slurm.cluster import Cluster, Job, SlurmProject, wait_until
 from tests.workflow.project import TEST_CONFIG, Project
 
@@ -56,7 +56,7 @@ def requeue(space: SlurmWorkspace, chance: random.Random) -> Hit:
     """An administrator requeues the job: it comes back under its number and goes on."""
     head, job, after = render_begun(space, chance)
     space.cluster.ask("scontrol", "requeue", job.job_id)
-    code = head.wait(timeout=600)
+    code = head.wait(timeout=PATIENCE_S)
     return Hit(f"scontrol requeue after {after}; the run ended with {code}")
 
 
@@ -64,7 +64,7 @@ def preempt(space: SlurmWorkspace, chance: random.Random) -> Hit:
     """An urgent job takes the node."""
     head, _, after = render_begun(space, chance)
     space.cluster.preempt_all()
-    code = head.wait(timeout=600)
+    code = head.wait(timeout=PATIENCE_S)
     return Hit(f"preempted after {after}; the run ended with {code}")
 
 
@@ -72,7 +72,7 @@ def cancelled(space: SlurmWorkspace, chance: random.Random) -> Hit:
     """A colleague's scancel: the attempt is lost, its sets are not."""
     head, job, after = render_begun(space, chance)
     space.cluster.ask("scancel", job.job_id)
-    code = head.wait(timeout=600)
+    code = head.wait(timeout=PATIENCE_S)
     return Hit(f"scancel after {after}; the run ended with {code}")
 
 
@@ -84,7 +84,7 @@ def timed_out(space: SlurmWorkspace, chance: random.Random) -> Hit:
     head, _, after = render_begun(space, chance)
     for process in space.processes(lambda words: OUTPUTS["render"] in words and "--work" in words):
         process.suspend()
-    code = head.wait(timeout=600)
+    code = head.wait(timeout=PATIENCE_S)
     return Hit(f"frozen until its time limit after {after}; the run ended with {code}")
 
 
@@ -125,29 +125,24 @@ SLURM_KINDS: list[tuple[str, SlurmStrike]] = [
 
 
 def slurm_trials(
-    count: int, seed: int, first: int, *, finished: Project | None, place: Path
-) -> list[Outcome]:
+    kinds: list[tuple[str, SlurmStrike]], seed: int, first: int, *, finished: Project, place: Path
+) -> Iterator[Outcome]:
     """Trials on a throw-away cluster, one after the other."""
-    outcomes: list[Outcome] = []
-    if not count:
-        return outcomes
+    if not kinds:
+        return
     cluster = Cluster()
     try:
         cluster.up()
-        for index, (name, strike) in enumerate(SLURM_KINDS[:count]):
+        for index, (name, strike) in enumerate(kinds):
             number, own = first + index, seed + 1000 + index
             space = SlurmWorkspace(finished, place / f"trial{number:03d}", cluster)
             try:
-                outcomes.append(
-                    slurm_trial(number, own, name, strike, space=space, finished=finished)
-                )
+                yield slurm_trial(number, own, name, strike, space=space, finished=finished)
             finally:
                 space.end()
                 space.remove()
-            print(outcomes[-1], flush=True)
     finally:
         cluster.down()
-    return outcomes
 
 
 def slurm_trial(
@@ -164,11 +159,11 @@ def slurm_trial(
     try:
         hit = strike(space, random.Random(seed))
         started = time.monotonic()
-        again = space.submit(*TARGET)
+        again = space.head(*TARGET).wait(timeout=PATIENCE_S)
         outcome = "identical after the same command"
         if again != 0 or space.digest() != finished.digest():
             survived, outcome = False, f"LOST: {again}, {difference(space, finished)}"
-    except (AssertionError, DefeatError) as error:
+    except (AssertionError, DefeatError, subprocess.TimeoutExpired) as error:
         survived, outcome = False, f"LOST: {error}"
     seconds = round(time.monotonic() - started, 1)
     return Outcome(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.chaos.signals import wait_for_end
 from tests.chaos.trial import Hit, Strike
-from tests.chaos.workspace import OUTPUTS, SHARD, WORK, TooLateError, Workspace
+from tests.chaos.workspace import OUTPUTS, PATIENCE_S, SHARD, WORK, TooLateError, Workspace
 
 FAKETIME = next(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"), None)
 
@@ -97,7 +97,7 @@ def two_heads(space: Workspace, chance: random.Random) -> Hit:
     said = second.stdout + second.stderr
     assert second.returncode != 0, said
     assert ("cannot be locked" if plain else "another run works in") in said, said
-    assert first.wait(timeout=900) == 0, space.said()
+    assert first.wait(timeout=PATIENCE_S) == 0, space.said()
     kind = "snakemake" if plain else "workflow/run.sh"
     return Hit(f"a second {kind} was refused, the first one finished")
 
@@ -122,7 +122,7 @@ def duplicate_worker(stage: str) -> Strike:
         assert second.returncode == 2, second
         assert f"{WORK[stage]} is in use" in second.stderr, second.stderr
         assert not (space.folder / OUTPUTS[stage]).exists()
-        assert head.wait(timeout=900) == 0, space.said()
+        assert head.wait(timeout=PATIENCE_S) == 0, space.said()
         return Hit("a second process of the job was refused by its lock, the first one finished")
 
     return strike

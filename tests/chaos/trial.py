@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 from tests.chaos.workspace import DATASET, TooLateError, Workspace
 from tests.workflow.project import Project
 
@@ -73,7 +75,7 @@ def run_trial(number: int, kind: Kind, seed: int, *, finished: Project, place: P
                 outcome, survived = f"DIFFERENT: {difference(space, finished)}", False
         except TooLateError:
             continue
-        except (DefeatError, AssertionError, subprocess.TimeoutExpired) as defeat:
+        except (DefeatError, AssertionError, subprocess.TimeoutExpired, psutil.Error) as defeat:
             outcome, survived = f"LOST: {defeat}", False
         finally:
             space.remove()

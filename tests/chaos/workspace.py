@@ -45,7 +45,7 @@ FOLLOWING = {
     "evaluate": [],
 }
 WORK = {"train": f"results/work/4_train/{ACTOR}", "render": f"results/work/5_render/{SHARD}"}
-PATIENCE_S = 900.0
+PATIENCE_S = 3600.0  # a busy machine is no defeat
 T = TypeVar("T")
 
 

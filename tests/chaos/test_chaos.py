@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.chaos.catalogue import IN_TESTS, deal, find, lacking
+from tests.chaos.catalogue import IN_TESTS, QUICK, SLOW, deal, find, lacking
 from tests.chaos.trial import run_trial
 
 SEED = 20261123
@@ -24,3 +24,8 @@ def test_a_deck_holds_every_kind_and_depends_on_its_seed():
     assert len(deck) == 80
     assert deck == deal(80, 1)
     assert deck != deal(80, 2)
+
+
+def test_a_disturbance_is_known_by_its_name_and_stage():
+    names = [(kind.name, kind.stage) for kind in [*QUICK, *SLOW]]
+    assert len(set(names)) == len(names)

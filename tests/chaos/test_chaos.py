@@ -10,7 +10,7 @@ SEED = 20261123
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("campaign")]
 
 
-@pytest.mark.parametrize(("name", "stage"), IN_TESTS, ids="-".join)
+@pytest.mark.parametrize(("name", "stage"), IN_TESTS, ids=["-".join(kind) for kind in IN_TESTS])
 def test_a_disturbed_campaign_ends_with_the_same_dataset(campaign, tmp_path, name, stage):
     kind = find(name, stage)
     if said := lacking(kind):

@@ -59,7 +59,7 @@ def line(number: int, where: str, margin: dict | None) -> str:
     unit = f" {margin['unit']}" if margin["unit"] else ""
     measured, limit = f"{margin['measured']:.2g}{unit}", f"{margin['limit']:.2g}{unit}"
     return (
-        f"| {number} | `{file}` `{test}` | {margin['what']} | {measured} "
+        f"| {number} | `{file}` `{test}` | {margin['what'].replace('|', chr(92) + '|')} | {measured} "
         f"| {margin['relation']} {limit} |"
     )
 

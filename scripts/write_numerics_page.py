@@ -58,8 +58,9 @@ def line(number: int, where: str, margin: dict | None) -> str:
         return f"| {number} | `{file}` `{test}` | exact or raises | | |"
     unit = f" {margin['unit']}" if margin["unit"] else ""
     measured, limit = f"{margin['measured']:.2g}{unit}", f"{margin['limit']:.2g}{unit}"
+    what = margin["what"].replace("|", "\\|")
     return (
-        f"| {number} | `{file}` `{test}` | {margin['what'].replace('|', chr(92) + '|')} | {measured} "
+        f"| {number} | `{file}` `{test}` | {what} | {measured} "
         f"| {margin['relation']} {limit} |"
     )
 

@@ -59,10 +59,7 @@ def line(number: int, where: str, margin: dict | None) -> str:
     unit = f" {margin['unit']}" if margin["unit"] else ""
     measured, limit = f"{margin['measured']:.2g}{unit}", f"{margin['limit']:.2g}{unit}"
     what = margin["what"].replace("|", "\\|")
-    return (
-        f"| {number} | `{file}` `{test}` | {what} | {measured} "
-        f"| {margin['relation']} {limit} |"
-    )
+    return f"| {number} | `{file}` `{test}` | {what} | {measured} | {margin['relation']} {limit} |"
 
 
 if __name__ == "__main__":

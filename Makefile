@@ -55,7 +55,7 @@ numerics: env
 
 # disturb the tiny campaign many times; the table of trials is docs/chaos.md (an hour or two)
 TRIALS ?= 60
-SEED ?= 1
+SEED ?= 7
 chaos: env
 	$(RUN) python -m tests.chaos --trials $(TRIALS) --seed $(SEED) --jobs $(CORES)
 

@@ -100,7 +100,7 @@ def reap() -> None:
 
 
 if __name__ == "__main__":
-    s5_render.pose_avatar = lambda *_: None
-    s5_render.render_view = lambda *_: None
+    s5_render.pose_avatar = lambda *_, **__: None
+    s5_render.render_view = lambda *_, **__: None
     s5_render.write_view = write_ready_view
     serve(sys.argv[1])

@@ -39,12 +39,12 @@ from benchmarks.subjects import painted
 from ntop.body.model import load_body_model
 from ntop.config.sections import TrainConfig
 from ntop.conventions import PIXEL_CENTRE
+from ntop.field.culling import body_pixels
 from ntop.field.devices import VISIBLE_VARIABLE, kernel_device
 from ntop.field.marching import MarchRule, Rays, Scene, march_on_cpu, march_rays
 from ntop.field.rendering import (
     PosedAvatar,
     RenderSettings,
-    body_pixels,
     pose_avatar,
     render_view,
 )
@@ -267,17 +267,16 @@ def show(posed: PosedAvatar, cameras: list[Camera]) -> list[Any]:
 
 def view_rays(posed: PosedAvatar, camera: Camera) -> tuple[Scene, Rays, MarchRule]:
     """One ray through the centre of each pixel that may see the body, as `render_view` sends."""
-    v, u = np.nonzero(body_pixels(posed, camera))
+    v, u = np.nonzero(body_pixels(posed.warp, camera))
     directions, valid = camera.rays(torch.from_numpy(np.stack([u, v], 1) + PIXEL_CENTRE))
     settings = RenderSettings()
     origin = camera.center_world.double().numpy() - posed.warp.origin_world
     chosen = np.ascontiguousarray(directions[valid].double().numpy())
-    scene = Scene(posed.grid.tables(), posed.warp.tables, posed.light, posed.labels)
     rays = Rays(np.zeros(1, np.int64), origin[None], chosen, np.full(len(chosen), settings.phase))
     rule = MarchRule(
         settings.step_m, settings.stop_transmittance, settings.colour_floor, settings.intervals
     )
-    return scene, rays, rule
+    return posed.scene, rays, rule
 
 
 PARTS: dict[str, Callable[[], dict[str, Any]]] = {

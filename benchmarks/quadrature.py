@@ -22,11 +22,11 @@ from matplotlib import pyplot as plt
 from benchmarks.environment import RESULTS, write_result
 from benchmarks.subjects import RIGS, Subject, subjects
 from ntop.conventions import PIXEL_CENTRE
+from ntop.field.culling import body_pixels
 from ntop.field.rendering import (
     PRESETS,
     PosedAvatar,
     RenderSettings,
-    body_pixels,
     render_view,
     trace_rays,
 )
@@ -124,7 +124,7 @@ def scene(person: Subject, rig: str, view: str) -> Scene:
     """Random pixels of one view, and their reference."""
     camera = person.cameras(rig)[view]
     posed = person.posed(BASE)
-    v, u = np.nonzero(body_pixels(posed, camera))
+    v, u = np.nonzero(body_pixels(posed.warp, camera))
     chosen = np.random.default_rng(0).permutation(len(v))[:RAYS_PER_VIEW]
     chosen.sort()
     pixels = np.stack([u, v], 1)[chosen] + PIXEL_CENTRE

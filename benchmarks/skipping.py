@@ -16,8 +16,9 @@ import torch
 from benchmarks.environment import write_result
 from benchmarks.subjects import RIGS, Subject, subjects
 from ntop.conventions import PIXEL_CENTRE
+from ntop.field.culling import body_pixels
 from ntop.field.paper_sampler import SAMPLES, box_interval
-from ntop.field.rendering import RenderSettings, body_pixels, render_view
+from ntop.field.rendering import RenderSettings, render_view
 from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import resized
 
@@ -129,7 +130,7 @@ def away(person: Subject) -> dict:
     posed = person.posed(ON)
     return {
         "subject": person.name,
-        "pixels": int(body_pixels(posed, up).sum()),
+        "pixels": int(body_pixels(posed.warp, up).sum()),
         "evaluations": render_view(posed, up, settings=ON).evaluations,
     }
 

@@ -64,6 +64,15 @@ class Occupancy:
     origin: Float[np.ndarray, " 3"]
     spacing_m: float
 
+    @functools.cached_property
+    def sums(self) -> Int[np.ndarray, "x1 y1 z1"]:
+        """How many marked cells lie below each corner of a cell (a summed-area table)."""
+        sums = np.zeros([n + 1 for n in self.cells.shape], np.int32)
+        sums[1:, 1:, 1:] = self.cells
+        for axis in range(3):
+            np.cumsum(sums, axis=axis, out=sums)
+        return sums
+
 
 @dataclass(frozen=True)
 class PartLabels:
@@ -144,9 +153,8 @@ def distance_grid(
         np.zeros((1, 3, 4)),
         dims,
         spacing_m,
-        reach_m + spacing_m,
+        np.array([reach_m + spacing_m, 0.0]),
         1.0,
-        1,
         nearest,
         squared,
     )

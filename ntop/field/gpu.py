@@ -75,6 +75,7 @@ class ReadyMarch:
         self._evaluations = _zeros(1)
         self._arguments = (
             _SCENE.tables(scene.grid), _SCENE.tables(scene.warp),
+            _SCENE.tables(scene.density), _SCENE.tables(scene.sheets),
             _SCENE.array("light", scene.light), _SCENE.array("labels", scene.labels.values),
             _SCENE.array("labels_origin", scene.labels.origin), 1 / scene.labels.spacing_m,
             *(_sent(array) for array in rays), *rule, *self._outputs, self._evaluations,

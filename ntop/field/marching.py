@@ -8,14 +8,17 @@ from jaxtyping import Float, Int, UInt8
 from ntop.field.canonical import PartLabels
 from ntop.field.devices import kernel_device
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
+from ntop.field.kernels.packed import PackedDensity, PackedSheets
 from ntop.field.kernels.tables import GridTables, WarpTables
 
 
 class Scene(NamedTuple):
-    """What is marched through: one avatar in one or several poses."""
+    """What is marched through: one avatar in one or several poses (`packing.packed_scene`)."""
 
     grid: GridTables
     warp: WarpTables
+    density: PackedDensity
+    sheets: PackedSheets
     light: Float[np.ndarray, "9 3"]
     labels: PartLabels
 
@@ -64,7 +67,8 @@ def march_on_cpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
     depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
     evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
     render_rays(
-        scene.grid, scene.warp, scene.light, scene.labels.values, scene.labels.origin,
-        1 / scene.labels.spacing_m, *rays, *rule, colours, opacity, depth, parts, evaluations,
+        scene.grid, scene.warp, scene.density, scene.sheets, scene.light, scene.labels.values,
+        scene.labels.origin, 1 / scene.labels.spacing_m, *rays, *rule, colours, opacity,
+        depth, parts, evaluations,
     )  # fmt: skip
     return Seen(colours, opacity, depth, parts, int(evaluations.sum()))

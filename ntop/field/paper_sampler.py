@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ntop.conventions import PIXEL_CENTRE
+from ntop.field.culling import body_pixels
 from ntop.field.kernels import paper
-from ntop.field.rendering import PosedAvatar, body_pixels
+from ntop.field.rendering import PosedAvatar
 from ntop.geometry.cameras import Camera
 
 SAMPLES = 128
@@ -110,7 +111,7 @@ def render_paper_view(
     `pixels`: only these, for measurements that need no others. Other arguments: see
     `trace_paper_rays`.
     """
-    mask = body_pixels(posed, camera) if pixels is None else pixels
+    mask = body_pixels(posed.warp, camera) if pixels is None else pixels
     v, u = np.nonzero(mask)
     directions, valid = camera.rays(torch.from_numpy(np.stack([u, v], 1) + PIXEL_CENTRE))
     v, u = v[valid.numpy()], u[valid.numpy()]

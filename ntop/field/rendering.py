@@ -3,12 +3,13 @@
 Only pixels that the projection of an occupied cell touches are marched; edges get four rays.
 """
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ntop.body.model import BodyModel
@@ -23,17 +24,17 @@ from ntop.field.canonical import (
     dense_voxels,
     label_grid,
 )
+from ntop.field.culling import body_pixels, pixel_window
+from ntop.field.edges import EDGE_OFFSETS_PX, edge_pixels, middle_ray
+from ntop.field.kernels.packed import PackedDensity
 from ntop.field.kernels.tables import EMPTY_RAW
-from ntop.field.kernels.tiles import TILE_PX, mark_tiles
 from ntop.field.marching import MarchRule, Rays, Scene, march_rays
+from ntop.field.packing import packed_density, packed_scene
+from ntop.field.straight import straight_colours
 from ntop.field.warp import PoseWarp, occupied, pose_warp, with_octants
-from ntop.geometry.cameras import Camera, Lens
+from ntop.geometry.cameras import Camera
 
 CELL_M = 0.012  # of the warp grid; a coarser one bends wrongly at joints (0.02: -0.6 dB)
-# four rays of a pixel on a rotated grid: distinct rows and columns, unbiased about the centre
-EDGE_OFFSETS_PX = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
-EDGE_ALPHA = (0.02, 0.98)
-EDGE_CONTRAST = 0.3  # colour difference to a neighbour from which a pixel counts as an edge
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class RenderSettings:
     Args:
         step_m: Largest length of a piece of a ray; faces of voxels cut it as well.
         stop_transmittance: Light left at which a ray ends (0: never); bounds the colour's error.
-        colour_floor: Weight below which a piece adds no colour (0: all do).
+        colour_floor: Light up to which pieces of a ray share one colour (0: each has its own).
         intervals: Jump over space that no warp cell covers.
         cells: Jump over octants of cells in which the field is empty.
         extent: How much of an octant is asked whether it is empty; less than 1 may miss density.
@@ -78,7 +79,7 @@ class RenderSettings:
 
 # chosen and measured by `make bench`: benchmarks/quadrature.py, docs/benchmarks.md
 PRESETS = {
-    "draft": RenderSettings(step_m=0.008, stop_transmittance=1e-2, colour_floor=1e-3, edge_rays=1),
+    "draft": RenderSettings(step_m=0.008, stop_transmittance=1e-2, colour_floor=2e-2, edge_rays=1),
     "default": RenderSettings(),
     "reference": RenderSettings(step_m=0.0005, stop_transmittance=1e-5, colour_floor=0.0),
 }
@@ -86,7 +87,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Rendering:
-    """One view. `rgb` is straight (not premultiplied) and meaningful where alpha > 0.
+    """One view. `rgb` is straight (not premultiplied), with a margin (`straight_colours`).
 
     `depth_m` is the ray length at which half of the light is gone, `parts` holds label + 1; both
     are 0 outside the mask (alpha below one half). `window` (left, top, width, height) holds every
@@ -115,12 +116,20 @@ class RayRendering:
 
 @dataclass(frozen=True)
 class PosedAvatar:
-    """All that the views of one pose share."""
+    """All that the views of one pose share; `density` is `grid`'s, packed, where it is known."""
 
     grid: CanonicalGrid
     warp: PoseWarp
     light: Float[np.ndarray, "9 3"]
     labels: PartLabels
+    density: PackedDensity | None = None
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """What rays march through, packed once for all views."""
+        return packed_scene(
+            self.grid, self.warp.tables, self.light, self.labels, density=self.density
+        )
 
 
 def pose_avatar(
@@ -135,31 +144,47 @@ def pose_avatar(
     settings = settings or RenderSettings()
     body = canonical_body(model, avatar.betas)
     warp = pose_warp(body, model, pose, cell_m=cell_m, reach_m=avatar.reach_m)
-    dense, labels = _shared(avatar, model)
+    shared = _shared(avatar, model)
     if settings.cells:
-        tables = occupied(warp.tables, dense, extent=settings.extent)
+        tables = occupied(warp.tables, shared.dense, extent=settings.extent)
     else:
         tables = with_octants(warp.tables, np.full_like(warp.tables.occupancy, 255))
     return PosedAvatar(
         grid=avatar.grid,
         warp=replace(warp, tables=tables),
         light=avatar.light.astype(np.float32),
-        labels=labels,
+        labels=shared.labels,
+        density=shared.density,
     )
 
 
-_SHARED: dict[tuple, tuple] = {}
+@dataclass(frozen=True)
+class _Shared:
+    """What is the same in every pose of an avatar; it holds what its key names."""
+
+    avatar: Avatar
+    model: BodyModel
+    dense: Occupancy
+    density: PackedDensity
+    labels: PartLabels
 
 
-def _shared(avatar: Avatar, model: BodyModel) -> tuple[Occupancy, PartLabels]:
-    """Dense voxels and labels of an avatar, the same in every pose; kept for the last one."""
+_SHARED: dict[tuple[int, int], _Shared] = {}
+
+
+def _shared(avatar: Avatar, model: BodyModel) -> _Shared:
+    """Made for an avatar's first pose, and kept for the last avatar."""
     key = (id(avatar), id(model))
     if key not in _SHARED:
         _SHARED.clear()
-        dense = dense_voxels(avatar.grid, raw_threshold=EMPTY_RAW)
-        labels = label_grid(canonical_body(model, avatar.betas))
-        _SHARED[key] = (dense, labels, avatar, model)  # held, so that no id is used twice
-    return _SHARED[key][:2]
+        _SHARED[key] = _Shared(
+            avatar,
+            model,
+            dense_voxels(avatar.grid, raw_threshold=EMPTY_RAW),
+            packed_density(avatar.grid),
+            label_grid(canonical_body(model, avatar.betas)),
+        )
+    return _SHARED[key]
 
 
 def trace_rays(
@@ -177,12 +202,11 @@ def trace_rays(
     count = len(directions_world)
     origin = center_world.double().numpy() - posed.warp.origin_world
     directions = unit_directions(origin, directions_world.double().numpy())
-    scene = Scene(posed.grid.tables(), posed.warp.tables, posed.light, posed.labels)
     rays = Rays(np.zeros(1, np.int64), origin[None], directions, np.full(count, settings.phase))
     rule = MarchRule(
         settings.step_m, settings.stop_transmittance, settings.colour_floor, settings.intervals
     )
-    seen = march_rays(scene, rays, rule)
+    seen = march_rays(posed.scene, rays, rule)
     if not (np.isfinite(seen.colours).all() and np.isfinite(seen.opacity).all()):
         raise DataError(
             "rendered pixels are not finite: the avatar holds NaN or infinity; train it again"
@@ -218,8 +242,8 @@ def render_view(
     alpha = np.zeros((height, width), np.float32)
     depth = np.zeros((height, width), np.float32)
     parts = np.zeros((height, width), np.uint8)
-    mask = body_pixels(posed, camera) if settings.crop else np.ones((height, width), bool)
-    window = _window(mask)
+    mask = body_pixels(posed.warp, camera) if settings.crop else np.ones((height, width), bool)
+    window = pixel_window(mask)
     left, top, columns, rows = window
     if columns == 0:
         return Rendering(rgb, alpha, depth, parts, window, 0)
@@ -227,68 +251,26 @@ def render_view(
     v, u = np.nonzero(mask[inner])
     centres = np.stack([u + left, v + top], 1) + PIXEL_CENTRE
     first = _trace_pixels(posed, camera, centres, settings=settings)
-    straight = np.zeros((rows, columns, 3), np.float32)
+    premultiplied = np.zeros((rows, columns, 3), np.float32)
     box_alpha = np.zeros((rows, columns), np.float32)
-    straight[v, u], box_alpha[v, u] = first.rgb, first.alpha
+    premultiplied[v, u], box_alpha[v, u] = first.rgb, first.alpha
     depth[v + top, u + left], parts[v + top, u + left] = first.depth_m, first.parts
     evaluations = first.evaluations
     if settings.edge_rays > 1:
-        edges = _edges(straight, box_alpha)[v, u]
+        edges = edge_pixels(premultiplied, box_alpha)[v, u]
         shifted = centres[edges][:, None] + np.array(EDGE_OFFSETS_PX)
         more = _trace_pixels(posed, camera, shifted.reshape(-1, 2), settings=settings)
-        straight[v[edges], u[edges]] = more.rgb.reshape(-1, 4, 3).mean(1)
+        premultiplied[v[edges], u[edges]] = more.rgb.reshape(-1, 4, 3).mean(1)
         box_alpha[v[edges], u[edges]] = more.alpha.reshape(-1, 4).mean(1)
-        chosen = np.arange(len(shifted)) * 4 + _middle(more)
+        chosen = np.arange(len(shifted)) * 4 + middle_ray(more.alpha, more.depth_m)
         depth[v[edges] + top, u[edges] + left] = more.depth_m[chosen]
         parts[v[edges] + top, u[edges] + left] = more.parts[chosen]
         evaluations += more.evaluations
-    straight /= np.maximum(box_alpha, 1e-6)[..., None]
-    rgb[inner] = np.clip(straight, 0, 1)
+    rgb[inner] = straight_colours(premultiplied, box_alpha)
     alpha[inner] = box_alpha
     empty = np.rint(255 * alpha) < MASK_ALPHA
     depth[empty], parts[empty] = 0, 0
     return Rendering(rgb, alpha, depth, parts, window, evaluations)
-
-
-def body_pixels(posed: PosedAvatar, camera: Camera) -> Bool[np.ndarray, "height width"]:
-    """Pixels that may see an occupied cell (conservative; whole tiles)."""
-    width, height = camera.lens.width, camera.lens.height
-    tables, cell_m = posed.warp.tables, posed.warp.cell_m
-    cells = tables.cells
-    full = np.flatnonzero((cells >= 0) & (tables.occupancy[np.maximum(cells, 0)] != 0))
-    index = np.stack(np.unravel_index(full, tables.dims[0]), 1)
-    centres = torch.from_numpy((index + 0.5) * cell_m + posed.warp.origin_world)
-    offsets = (centres - camera.center_world) @ camera.rotation.T
-    distances = offsets.norm(dim=-1)
-    radius = cell_m * math.sqrt(3) / 2
-    marked = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.uint8)
-    if len(full) and float(distances.min()) < 2 * radius:
-        marked[:] = 1  # the camera is inside the body: every pixel may see it
-    else:
-        pixels, radii_px, usable = _blots(offsets, torch.asin(radius / distances), camera.lens)
-        mark_tiles(pixels.numpy(), radii_px.numpy(), usable.numpy(), marked)
-    return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[:height, :width].astype(bool)
-
-
-def _blots(
-    offsets: Float[Tensor, "cell 3"], angles: Float[Tensor, " cell"], lens: Lens
-) -> tuple[Float[Tensor, "cell 2"], Float[Tensor, " cell"], Bool[Tensor, " cell"]]:
-    """Discs in the image that hold those of small spheres, for any lens: centres, radii, which.
-
-    `angles` are the spheres' angular radii. A sphere whose centre the lens does not image stands
-    for itself on the rim, at most its own angle away, so that its disc is twice as large. Seen
-    from the camera's frame, beyond 90 degrees as well.
-    """
-    across = torch.hypot(offsets[:, 0], offsets[:, 1])
-    theta = torch.atan2(across, offsets[:, 2])
-    rim = lens.max_theta * (1 - 1e-9)  # inside whatever the rounding
-    outside = theta > rim
-    azimuth = torch.atan2(offsets[:, 1], offsets[:, 0])
-    sine, cosine = math.sin(rim), torch.full_like(theta, math.cos(rim))
-    on_rim = torch.stack([sine * azimuth.cos(), sine * azimuth.sin(), cosine], -1)
-    pixels, _ = lens.project(torch.where(outside[:, None], on_rim, offsets))
-    radii_px = lens.max_px_per_rad * angles * (1 + outside.double())
-    return pixels, radii_px, theta - angles <= lens.max_theta
 
 
 def _trace_pixels(
@@ -309,34 +291,3 @@ def _trace_pixels(
         everywhere[kept] = values
         spread.append(everywhere)
     return RayRendering(*spread, found.evaluations)
-
-
-def _middle(rays: RayRendering) -> Int[np.ndarray, " pixel"]:
-    """Which of a pixel's four rays speaks for it: the nearer median of those that meet the body."""
-    depths = np.where(rays.alpha >= 0.5, rays.depth_m, np.inf).reshape(-1, 4)
-    order = np.argsort(depths, axis=1, kind="stable")
-    middle = (np.maximum(np.isfinite(depths).sum(1), 1) - 1) // 2
-    return np.take_along_axis(order, middle[:, None], 1)[:, 0]
-
-
-def _window(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return 0, 0, 0, 0
-    left, top = int(columns[0]), int(rows[0])
-    return left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top
-
-
-def _edges(
-    premultiplied: Float[np.ndarray, "height width 3"], alpha: Float[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
-    """Pixels that are partly covered, or differ from a neighbour in opacity or colour."""
-    edges = (alpha > EDGE_ALPHA[0]) & (alpha < EDGE_ALPHA[1])
-    layers = np.concatenate([premultiplied, alpha[..., None]], -1)
-    for axis in (0, 1):
-        step = np.abs(np.diff(layers, axis=axis)).max(-1) > EDGE_CONTRAST
-        first = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
-        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
-        edges[first] |= step
-        edges[second] |= step
-    return edges

@@ -26,7 +26,8 @@ from ntop.field.checkpoints import TrainingState, load_checkpoint, save_checkpoi
 from ntop.field.devices import kernel_device
 from ntop.field.kernels.tables import WarpTables
 from ntop.field.learners import CpuLearner, Learner, StepRule, StepSums
-from ntop.field.marching import MarchRule, Rays, Scene, march_on_cpu
+from ntop.field.marching import MarchRule, Rays, march_on_cpu
+from ntop.field.packing import packed_scene
 from ntop.field.views import RayBatch, RaySource, TrainingViews
 from ntop.field.warp import joined, occupied, octant_radius_m, pose_warp
 
@@ -311,7 +312,8 @@ def watched_psnr(
 ) -> float:
     """PSNR of rays of the views set aside, over black."""
     unlabelled = PartLabels(np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0)
-    scene = Scene(state.grid.tables(), tables, state.light.astype(np.float32), unlabelled)
+    light = state.light.astype(np.float32)
+    scene = packed_scene(state.grid, tables, light, unlabelled, poses=batch.poses)
     offsets = np.full(len(batch.poses), 0.5)
     rays = Rays(batch.poses, batch.origins, batch.directions, offsets)
     rule = MarchRule(_march_step(state, settings), STOP_TRANSMITTANCE, 0.0, skipping=True)

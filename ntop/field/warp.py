@@ -15,11 +15,11 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
 from ntop.field.canonical import CanonicalBody, Occupancy
+from ntop.field.kernels.occupancy import octant_occupancy
 from ntop.field.kernels.posing import (
     cell_sheets,
     nearest_vertices,
     node_records,
-    octant_occupancy,
     vertex_maps,
 )
 from ntop.field.kernels.tables import WarpTables
@@ -27,6 +27,7 @@ from ntop.field.kernels.tables import WarpTables
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
+FACE_M = 0.032  # how far a point of the body's surface may be from every vertex
 MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
 MAX_AWAY = 8  # blocks; how far a ray may jump over empty space at once
 STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
@@ -74,8 +75,8 @@ def pose_warp(
     nearest = np.empty((2, count), np.int32)
     distance = np.empty((2, count), np.float32)
     nearest_vertices(
-        vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m, radius, APART_M,
-        2, nearest, distance,
+        vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m,
+        np.array([radius, min(radius, math.hypot(reach_m, FACE_M))]), APART_M, nearest, distance,
     )  # fmt: skip
     candidates, nodes = np.nonzero(nearest >= 0)
     records = np.empty((len(nodes), 6), np.float32)
@@ -121,7 +122,7 @@ def occupied(tables: WarpTables, occupancy: Occupancy, *, extent: float = 0.0) -
     """
     found = np.empty_like(tables.occupancy)
     octant_occupancy(
-        tables, occupancy.cells, occupancy.origin, 1 / occupancy.spacing_m, extent, found
+        tables, occupancy.sums, occupancy.origin, 1 / occupancy.spacing_m, extent, found
     )
     return with_octants(tables, found)
 

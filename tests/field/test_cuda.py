@@ -18,7 +18,8 @@ from ntop.field import twin
 from ntop.field.canonical import Occupancy, PartLabels
 from ntop.field.checkpoints import TrainingState
 from ntop.field.learners import CpuLearner, StepRule
-from ntop.field.marching import MarchRule, Rays, Scene, march_on_cpu
+from ntop.field.marching import MarchRule, Rays, march_on_cpu
+from ntop.field.packing import packed_scene
 from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
 from ntop.field.views import RayBatch
 from ntop.field.warp import identity_warp, joined
@@ -58,7 +59,8 @@ def march_case():
     origins, directions = random_rays(MARCHED)
     generator = np.random.default_rng(3)
     labels = PartLabels(generator.integers(1, 24, (7, 7, 7), np.uint8), np.zeros(3), 0.1)
-    scene = Scene(ball_grid().tables(), joined([one, two]), light_of().astype(np.float32), labels)
+    tables = joined([one, two])
+    scene = packed_scene(ball_grid(), tables, light_of().astype(np.float32), labels)
     poses = np.arange(MARCHED) % 2
     rays = Rays(poses, origins, directions, generator.random(MARCHED))
     return scene, rays, MarchRule(STEP_M, 0.0, 0.0, skipping=True)  # a bound jumps

@@ -11,6 +11,7 @@ from ntop.field import twin
 from ntop.field.kernels.adjoint import train_rays
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tables import EMPTY_DENSITY
+from ntop.field.packing import packed_density, packed_sheets
 from tests.field.conftest import ball_grid, random_rays
 
 STEP_M = 0.01
@@ -30,9 +31,9 @@ def rendered(grid, warp, origins, directions, *, offsets, light, stop=0.0, step_
     depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
     evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
     render_rays(
-        grid.tables(), warp.tables, light, np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0,
-        np.zeros(1, np.int64), origins, directions, offsets, step_m, stop, 0.0, True, colours,
-        opacity, depth, parts, evaluations,
+        grid.tables(), warp.tables, packed_density(grid), packed_sheets(grid.tables(), warp.tables),
+        light, np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0, np.zeros(1, np.int64), origins,
+        directions, offsets, step_m, stop, 0.0, True, colours, opacity, depth, parts, evaluations,
     )  # fmt: skip
     return colours, opacity, depth, evaluations
 

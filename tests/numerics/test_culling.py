@@ -10,7 +10,8 @@ import torch
 
 from benchmarks.subjects import painted
 from ntop.conventions import PIXEL_CENTRE
-from ntop.field.rendering import PRESETS, RenderSettings, body_pixels, render_view, trace_rays
+from ntop.field.culling import body_pixels
+from ntop.field.rendering import PRESETS, RenderSettings, render_view, trace_rays
 from ntop.geometry.windows import resized
 
 SIDE = 160
@@ -60,7 +61,7 @@ def test_27_the_default_preset_is_close_to_the_integral(margin, person):
     for rig, view in (("h1.0_r0.5", "e"), ("h1.2_r1.0", "ne")):
         camera = person.cameras(rig)[view]
         posed = person.posed(ONE_RAY)
-        v, u = np.nonzero(body_pixels(posed, camera))
+        v, u = np.nonzero(body_pixels(posed.warp, camera))
         chosen = np.random.default_rng(0).permutation(len(v))[:2500]
         pixels = np.stack([u, v], 1)[chosen] + PIXEL_CENTRE
         directions, valid = camera.rays(torch.from_numpy(pixels))

@@ -11,8 +11,9 @@ from ntop.body.model import load_body_model
 from ntop.body.skinning import pose_body
 from ntop.field import twin
 from ntop.field.canonical import Occupancy, refined_grid
+from ntop.field.culling import body_pixels
 from ntop.field.kernels.tables import VOID_RAW
-from ntop.field.rendering import RenderSettings, body_pixels, render_view, trace_rays
+from ntop.field.rendering import RenderSettings, render_view, trace_rays
 from ntop.geometry.cameras import Camera, Equidistant, Pinhole, pixel_grid
 from ntop.geometry.rigs import ROTATION_LOOKING_DOWN, Rig, top_view_cameras
 from tests.numerics.avatars import analytic_avatar, posed_at, standing
@@ -145,7 +146,7 @@ def test_16_culling_keeps_the_hand_that_is_beyond_ninety_degrees(person):
     whole = render_view(posed, camera, settings=RenderSettings(edge_rays=1, crop=False))
     assert (whole.alpha > 0.5).sum() > 50
     assert np.array_equal(culled.alpha, whole.alpha)
-    assert (body_pixels(posed, camera) | (whole.alpha == 0)).all()
+    assert (body_pixels(posed.warp, camera) | (whole.alpha == 0)).all()
 
 
 def linear(points):

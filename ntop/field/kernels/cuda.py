@@ -43,15 +43,16 @@ LARGEST = 2.0**20  # of what is added; a ray's slopes are of the order of 1
 
 @cuda.jit(cache=True)
 def march_rays(
-    grid, warp, light, labels, labels_origin, inverse_spacing, poses, origins, directions, offsets,
-    step, stop, colour_floor, skipping, colours, opacity, depth, parts, evaluations,
+    grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
+    directions, offsets, step, stop, colour_floor, skipping, colours, opacity, depth, parts,
+    evaluations,
 ):  # fmt: skip
     """As `march.render_rays`, but `evaluations` (1,) int64 is their sum."""
     r = cuda.grid(1)
     if r >= directions.shape[0]:
         return
     red, green, blue, opaque, median, part, number = march_ray(
-        grid, warp, light, labels, labels_origin, inverse_spacing,
+        grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
         poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
         directions[r], offsets[r], step, stop, colour_floor, skipping,
     )  # fmt: skip

@@ -17,52 +17,55 @@ import math
 import numba
 
 from ntop.field.kernels import device, kernel
+from ntop.field.kernels.packed import brick_of, raw_density, trilinear, voxel_corners
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
     EMPTY_DENSITY,
     EMPTY_RAW,
     HUGE,
     TINY_M,
-    canonical_point,
     next_octant,
     raw_colour,
-    raw_density,
+    safe_inverse,
     shade,
     sigmoid,
-    softplus,
     start_ray,
-    surface_normal,
-    voxel_corners,
     voxel_of,
 )
 
 RAYS_PER_CHUNK = 128
 MEDIAN_DEPTH = math.log(2.0)  # optical depth at which half of the light is gone
 GAUSS_POINT = 1 / math.sqrt(3)  # of two, on [-1, 1]
-NO_SHEET = -1e6  # a place, in voxels
 THIN = 1e-3  # optical depth below which a series replaces a difference that cancels
 ON_FACE = 1e-6  # how near a face or node counts as on it, in voxels or steps
 
 
 @device
-def sheet_place(grid, warp, cell, sheet, fx, fy, fz):
-    """Canonical place (3, voxels) of a point of a cell; NO_SHEET where it has no such sheet."""
-    if warp.sheets[cell, sheet, 0] < 0:
-        return NO_SHEET, NO_SHEET, NO_SHEET
-    x, y, z = canonical_point(warp, cell, sheet, fx, fy, fz)
-    return (
-        (x - grid.origin[0]) * grid.inverse_voxel,
-        (y - grid.origin[1]) * grid.inverse_voxel,
-        (z - grid.origin[2]) * grid.inverse_voxel,
-    )
+def sheet_place(sheets, cell, sheet, fx, fy, fz):
+    """Canonical place (3, voxels) of a point of a cell on one of its sheets."""
+    return trilinear(sheets.corners[sheets.rows[cell, sheet]], 0, fx, fy, fz)
+
+
+@device
+def surface_normal(sheets, cell, sheet, fx, fy, fz):
+    """World normal (3) at a point of a cell, of unit length."""
+    x, y, z = trilinear(sheets.corners[sheets.rows[cell, sheet]], 24, fx, fy, fz)
+    scale = 1 / math.sqrt(x * x + y * y + z * z + 1e-12)  # opposite normals may cancel
+    return x * scale, y * scale, z * scale
 
 
 @device
 def path_between(start, end, length):
-    """A straight path: place on entry (3, voxels) and voxels per metre (3)."""
+    """A straight path: place on entry (3, voxels), voxels per metre (3), and their inverse (3)."""
+    inverse = 1 / length
+    dx, dy, dz = (
+        (end[0] - start[0]) * inverse,
+        (end[1] - start[1]) * inverse,
+        (end[2] - start[2]) * inverse,
+    )
     return (
-        start[0], start[1], start[2],
-        (end[0] - start[0]) / length, (end[1] - start[1]) / length, (end[2] - start[2]) / length,
+        start[0], start[1], start[2], dx, dy, dz,
+        safe_inverse(dx), safe_inverse(dy), safe_inverse(dz),
     )  # fmt: skip
 
 
@@ -73,12 +76,12 @@ def along(path, s):
 
 
 @device
-def to_next_face(place, velocity):
-    """Metres until a coordinate in voxels crosses a face."""
+def to_next_face(place, velocity, inverse):
+    """Metres until a coordinate in voxels crosses a face; far away where it stands still."""
     if velocity > 0:
-        return (math.floor(place + ON_FACE) + 1 - place) / velocity
+        return (math.floor(place + ON_FACE) + 1 - place) * inverse
     if velocity < 0:
-        return (math.ceil(place - ON_FACE) - 1 - place) / velocity
+        return (math.ceil(place - ON_FACE) - 1 - place) * inverse
     return HUGE
 
 
@@ -86,24 +89,41 @@ def to_next_face(place, velocity):
 def to_next_voxel(path, s):
     """Metres until a path that has gone `s` leaves its voxel."""
     x, y, z = along(path, s)
-    return min(to_next_face(x, path[3]), min(to_next_face(y, path[4]), to_next_face(z, path[5])))
+    return min(
+        to_next_face(x, path[3], path[6]),
+        min(to_next_face(y, path[4], path[7]), to_next_face(z, path[5], path[8])),
+    )
 
 
 @device
-def mean_place(tau):
-    """Where a homogeneous piece of optical depth tau takes its light on average, as a share."""
+def mean_place(tau, lost):
+    """Where a homogeneous piece of optical depth tau takes its light on average, as a share.
+
+    `lost` is exp(-tau) - 1, so that 1 / tau - 1 / (exp(tau) - 1) needs no exponential of its own.
+    """
     if tau < THIN:
         return 0.5 - tau / 12
-    return 1 / tau - 1 / math.expm1(tau)
+    return 1 / tau + (1 + lost) / lost
 
 
 @device
-def denser_place(grid, first, second, two, s):
+def rendered_density(raw):
+    """Density per DENSITY_SCALE of a raw value above EMPTY_RAW: softplus less what is empty.
+
+    So far from -infinity log(1 + e) loses nothing, and is cheaper than log1p.
+    """
+    return max(raw, 0.0) + math.log(1 + math.exp(-abs(raw))) - EMPTY_DENSITY
+
+
+@device
+def denser_place(grid, density, first, second, two, s):
     """Which of a ray's one or two sheets is the denser after `s` metres, and the place there."""
     x, y, z = along(first, s)
     if two:
         other_x, other_y, other_z = along(second, s)
-        if raw_density(grid, other_x, other_y, other_z) > raw_density(grid, x, y, z):
+        if raw_density(grid, density, other_x, other_y, other_z) > raw_density(
+            grid, density, x, y, z
+        ):
             return 1, other_x, other_y, other_z
     return 0, x, y, z
 
@@ -125,8 +145,8 @@ def part_at(grid, labels, labels_origin, inverse_spacing, x, y, z):
 
 @device
 def march_ray(
-    grid, warp, light, labels, labels_origin, inverse_spacing, pose, origin, direction, offset,
-    step, stop, colour_floor, skipping,
+    grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, pose, origin,
+    direction, offset, step, stop, colour_floor, skipping,
 ):  # fmt: skip
     """One ray; arguments as of `render_rays`.
 
@@ -135,11 +155,12 @@ def march_ray(
     """
     ray, t, far = start_ray(warp, pose, origin, direction)
     red = green = blue = 0.0
+    coloured = carried = 0.0
     thickness, transmittance = 0.0, 1.0
     depth, part = 0.0, 0
     looked_up = 0
     last_cell, last_t = -1, -1.0
-    end_a = end_b = (NO_SHEET, NO_SHEET, NO_SHEET)
+    end_a = end_b = (0.0, 0.0, 0.0)
     while transmittance >= stop:
         t, leave, cell, fx, fy, fz = next_octant(warp, pose, ray, t, far, skipping)
         if cell == -1:
@@ -149,18 +170,22 @@ def march_ray(
             t = leave
             continue
         length = leave - t
+        two = sheets.rows[cell, 1] >= 0
         if cell == last_cell and t == last_t:
             start_a, start_b = end_a, end_b
         else:
-            start_a = sheet_place(grid, warp, cell, 0, fx, fy, fz)
-            start_b = sheet_place(grid, warp, cell, 1, fx, fy, fz)
+            start_a = sheet_place(sheets, cell, 0, fx, fy, fz)
+            start_b = start_a
+            if two:
+                start_b = sheet_place(sheets, cell, 1, fx, fy, fz)
         gx, gy, gz = fx + length * ray[3], fy + length * ray[4], fz + length * ray[5]
-        end_a = sheet_place(grid, warp, cell, 0, gx, gy, gz)
-        end_b = sheet_place(grid, warp, cell, 1, gx, gy, gz)
+        end_a = sheet_place(sheets, cell, 0, gx, gy, gz)
         last_cell, last_t = cell, leave
         path_a = path_between(start_a, end_a, length)
-        path_b = path_between(start_b, end_b, length)
-        two = start_b[0] > NO_SHEET
+        path_b = path_a
+        if two:
+            end_b = sheet_place(sheets, cell, 1, gx, gy, gz)
+            path_b = path_between(start_b, end_b, length)
         s = 0.0
         while s < length and transmittance >= stop:
             # to the next face of a voxel
@@ -170,8 +195,12 @@ def march_ray(
             border = min(s + max(border, TINY_M), length)
             x, y, z = along(path_a, 0.5 * (s + border))
             i, j, k = voxel_of(grid, x, y, z)
-            c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(grid, i, j, k)
+            slot = brick_of(density, i, j, k)
             looked_up += 1
+            if slot == 0 and not two:
+                s = border
+                continue
+            c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(density, slot, i, j, k)
             empty = c0 <= EMPTY_RAW and c1 <= EMPTY_RAW and c2 <= EMPTY_RAW and c3 <= EMPTY_RAW
             empty = empty and c4 <= EMPTY_RAW and c5 <= EMPTY_RAW
             if empty and c6 <= EMPTY_RAW and c7 <= EMPTY_RAW and not two:
@@ -188,7 +217,7 @@ def march_ray(
                 node = (math.floor((t + s) / step - offset + ON_FACE) + 1 + offset) * step - t
                 end = max(min(node, border), s + TINY_M)
                 half = 0.5 * (end - s)
-                density = slope = 0.0
+                mass = slope = 0.0
                 for side in (-1, 1):
                     q = s + half * (1 + GAUSS_POINT * side)
                     x, y, z = along(path_a, q)
@@ -196,62 +225,74 @@ def march_ray(
                     raw = c0 + x * (c4 + y * (c6 + z * c7) + z * c5) + y * (c2 + z * c3) + z * c1
                     if two:
                         x, y, z = along(path_b, q)
-                        raw = max(raw, raw_density(grid, x, y, z))
+                        raw = max(raw, raw_density(grid, density, x, y, z))
                     looked_up += 1
                     if not raw <= EMPTY_RAW:  # NaN must stay visible
-                        found = softplus(raw) - EMPTY_DENSITY
-                        density += found
+                        found = rendered_density(raw)
+                        mass += found
                         slope += found * side
-                if not density <= 0:
-                    tau = DENSITY_SCALE * density * half
+                if not mass <= 0:
+                    tau = DENSITY_SCALE * mass * half
                     if thickness < MEDIAN_DEPTH <= thickness + tau:
                         q = s + (end - s) * (MEDIAN_DEPTH - thickness) / tau
-                        _, x, y, z = denser_place(grid, path_a, path_b, two, q)
+                        _, x, y, z = denser_place(grid, density, path_a, path_b, two, q)
                         part = part_at(grid, labels, labels_origin, inverse_spacing, x, y, z)
                         depth = t + q
                     # the halves of the piece, with a density that rises or falls evenly
-                    first = tau * (0.5 - 0.25 / GAUSS_POINT * slope / density)
+                    first = tau * (0.5 - 0.25 / GAUSS_POINT * slope / mass)
                     first = min(max(first, 0.0), tau)
                     second = tau - first
-                    weight_first = transmittance * -math.expm1(-first)
-                    weight_second = (transmittance - weight_first) * -math.expm1(-second)
+                    lost_first, lost_second = math.expm1(-first), math.expm1(-second)
+                    weight_first = transmittance * -lost_first
+                    weight_second = (transmittance - weight_first) * -lost_second
                     weight = weight_first + weight_second
-                    if weight > colour_floor:
+                    # a little light takes the colour of what comes next on its ray
+                    if carried + weight > colour_floor:
                         q = s + half * (
-                            weight_first * mean_place(first)
-                            + weight_second * (1 + mean_place(second))
+                            weight_first * mean_place(first, lost_first)
+                            + weight_second * (1 + mean_place(second, lost_second))
                         ) / weight  # fmt: skip
-                        sheet, x, y, z = denser_place(grid, path_a, path_b, two, q)
+                        sheet, x, y, z = denser_place(grid, density, path_a, path_b, two, q)
                         raw_red, raw_green, raw_blue = raw_colour(grid, x, y, z)
                         nx, ny, nz = surface_normal(
-                            warp, cell, sheet, fx + q * ray[3], fy + q * ray[4], fz + q * ray[5]
+                            sheets, cell, sheet, fx + q * ray[3], fy + q * ray[4], fz + q * ray[5]
                         )
+                        weight += carried
                         red += weight * sigmoid(raw_red) * shade(light, 0, nx, ny, nz)
                         green += weight * sigmoid(raw_green) * shade(light, 1, nx, ny, nz)
                         blue += weight * sigmoid(raw_blue) * shade(light, 2, nx, ny, nz)
+                        coloured += weight
+                        carried = 0.0
+                    else:
+                        carried += weight
                     thickness += tau
-                    transmittance = math.exp(-thickness)
+                    transmittance *= (1 + lost_first) * (1 + lost_second)
                 s = end
             s = max(s, border)
         t = leave
+    if coloured > 0:  # what is still carried takes the colour of what came before
+        share = 1 + carried / coloured
+        red, green, blue = red * share, green * share, blue * share
     return red, green, blue, -math.expm1(-thickness), depth, part, looked_up
 
 
 @kernel
 def render_rays(
-    grid, warp, light, labels, labels_origin, inverse_spacing, poses, origins, directions, offsets,
-    step, stop, colour_floor, skipping, colours, opacity, depth, parts, evaluations,
+    grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
+    directions, offsets, step, stop, colour_floor, skipping, colours, opacity, depth, parts,
+    evaluations,
 ):  # fmt: skip
     """Colour, opacity, median depth and part of each ray.
 
     Args:
-        grid, warp: Tables. light: (9, 3) see `shade`. labels: part values on a canonical grid.
-        labels_origin, inverse_spacing: Of that grid (metres, 1/m).
+        grid, warp: Tables. density, sheets: The same, packed. light: (9, 3) see `shade`.
+        labels: part values on a canonical grid. labels_origin, inverse_spacing: Of that
+            grid (metres, 1/m).
         poses: (1 or rays,) which pose of `warp`.
         origins: (1 or rays, 3) relative to the warp grid's origin. directions: (rays, 3) unit.
         offsets: (rays,) of the lattice that bounds pieces, in steps. step: of it, metres.
         stop: transmittance below which a ray ends.
-        colour_floor: weight up to which a piece's colour is not looked up.
+        colour_floor: light up to which pieces share the colour of the next one that is looked up.
         skipping: whether rays jump over octants that are not occupied.
         colours, opacity, depth, parts: Outputs; colours are premultiplied, depth is metres along
             the ray where half of the light is gone, 0 where less is lost.
@@ -262,7 +303,7 @@ def render_rays(
         looked_up = 0
         for r in range(chunk * RAYS_PER_CHUNK, min(count, (chunk + 1) * RAYS_PER_CHUNK)):
             red, green, blue, opaque, median, part, number = march_ray(
-                grid, warp, light, labels, labels_origin, inverse_spacing,
+                grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
                 poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
                 directions[r], offsets[r], step, stop, colour_floor, skipping,
             )  # fmt: skip

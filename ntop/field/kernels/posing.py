@@ -9,7 +9,6 @@ import numba
 import numpy as np
 
 from ntop.field.kernels import device, kernel
-from ntop.field.kernels.tables import canonical_point
 
 MAX_STRETCH = 6.0  # of an inverse's squared Frobenius norm; 3 is rigid, beyond it is no use
 TINY_VOLUME = 1e-6
@@ -79,27 +78,28 @@ def squared_gap(one, other, x, y, z):
 
 
 @kernel
-def nearest_vertices(posed, maps, dims, cell, radius, apart, candidates, nearest, distance):
+def nearest_vertices(posed, maps, dims, cell, radii, apart, nearest, distance):
     """For each node the nearest posed vertex, and the nearest that leads elsewhere.
 
     Args:
         posed: (V, 3) metres relative to node (0, 0, 0).
         maps: (V, 3, 4) posed -> canonical, read for the second candidate only.
-        dims: (3,) nodes. cell: node spacing (m). radius: search radius (m).
+        dims: (3,) nodes. cell: node spacing (m).
+        radii: (2,) search radii (m) of the two; the second is left empty if its radius is 0.
         apart: distance (m) of the two canonical places of a node from which a vertex leads
             elsewhere. Both sides of a wrist lead to the same place, an arm and a trunk do not.
-        candidates: 1 or 2; with 1 the second is left empty.
         nearest: (2, nodes) int32 output, -1 where none. distance: (2, nodes) squared metres.
     """
     ny, nz = dims[1], dims[2]
-    limit = radius * radius
     inverse = 1 / cell
     for slab in numba.prange((dims[0] + SLAB - 1) // SLAB):
         first, last = slab * SLAB, min(dims[0], (slab + 1) * SLAB) - 1
         for n in range(first * ny * nz, (last + 1) * ny * nz):
             nearest[0, n] = nearest[1, n] = -1
-            distance[0, n] = distance[1, n] = limit
-        for candidate in range(candidates):
+            distance[0, n], distance[1, n] = radii[0] * radii[0], radii[1] * radii[1]
+        for candidate in range(2 if radii[1] > 0 else 1):
+            radius = radii[candidate]
+            limit = radius * radius
             for v in range(posed.shape[0]):
                 x, y, z = posed[v, 0], posed[v, 1], posed[v, 2]
                 i0 = max(first, int(math.ceil((x - radius) * inverse)))
@@ -116,7 +116,11 @@ def nearest_vertices(posed, maps, dims, cell, radius, apart, candidates, nearest
                         dxy = dx + (j * cell - y) ** 2
                         if dxy >= limit:
                             continue
-                        for k in range(k0, k1 + 1):
+                        along = math.sqrt(limit - dxy)  # half of what is left of the sphere
+                        for k in range(
+                            max(k0, int(math.ceil((z - along) * inverse))),
+                            min(k1, int(math.floor((z + along) * inverse))) + 1,
+                        ):
                             d = dxy + (k * cell - z) ** 2
                             n = (i * ny + j) * nz + k
                             if d < distance[candidate, n]:
@@ -347,71 +351,3 @@ def cell_sheets(
                         extra[number, used, 3 + a] = normals[vertex, a]
                     used += 1
         extra_count[number] = used
-
-
-@device
-def image_of_box(warp, cell, sheet, centre, half, low, high):
-    """Bounds (3 each) of the canonical image of a box in a cell.
-
-    `centre` (3) and `half` are in cells. A trilinear map sends a box into the hull of the images of
-    its corners, so nothing of the image lies outside.
-    """
-    low[:], high[:] = np.inf, -np.inf
-    for corner in range(8 if half > 0 else 1):
-        x, y, z = canonical_point(
-            warp, cell, sheet,
-            centre[0] + (half if corner & 4 else -half),
-            centre[1] + (half if corner & 2 else -half),
-            centre[2] + (half if corner & 1 else -half),
-        )  # fmt: skip
-        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
-        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
-
-
-@device
-def any_marked(marked, origin, inverse_spacing, low, high):
-    """Is a cell of the grid `marked` (origin in metres) set that the box low..high touches?"""
-    i0 = max(int(math.floor((low[0] - origin[0]) * inverse_spacing)), 0)
-    j0 = max(int(math.floor((low[1] - origin[1]) * inverse_spacing)), 0)
-    k0 = max(int(math.floor((low[2] - origin[2]) * inverse_spacing)), 0)
-    i1 = min(int(math.floor((high[0] - origin[0]) * inverse_spacing)), marked.shape[0] - 1)
-    j1 = min(int(math.floor((high[1] - origin[1]) * inverse_spacing)), marked.shape[1] - 1)
-    k1 = min(int(math.floor((high[2] - origin[2]) * inverse_spacing)), marked.shape[2] - 1)
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            for k in range(k0, k1 + 1):
-                if marked[i, j, k]:
-                    return True
-    return False
-
-
-@kernel
-def octant_occupancy(warp, canonical_occupancy, origin, inverse_spacing, extent, occupancy):
-    """Bit c of a cell: does the canonical occupancy allow density in octant c?
-
-    Args:
-        extent: how much of each octant is looked at: 1 is all of it, so that no density is missed;
-            0 is its centre alone, for an occupancy dilated by the half diagonal of an octant.
-        occupancy: (cells,) uint8 output.
-    """
-    for cell in numba.prange(occupancy.shape[0]):
-        centre, low, high = np.empty(3), np.empty(3), np.empty(3)
-        bits = 0
-        for sheet in range(2):
-            if warp.sheets[cell, sheet, 0] < 0:
-                continue
-            if extent > 0:
-                centre[:] = 0.5
-                image_of_box(warp, cell, sheet, centre, 0.5, low, high)
-                if not any_marked(canonical_occupancy, origin, inverse_spacing, low, high):
-                    continue
-            for octant in range(8):
-                if (bits >> octant) & 1:
-                    continue
-                centre[0] = 0.75 if octant & 4 else 0.25
-                centre[1] = 0.75 if octant & 2 else 0.25
-                centre[2] = 0.75 if octant & 1 else 0.25
-                image_of_box(warp, cell, sheet, centre, 0.25 * extent, low, high)
-                if any_marked(canonical_occupancy, origin, inverse_spacing, low, high):
-                    bits |= 1 << octant
-        occupancy[cell] = bits

@@ -26,7 +26,8 @@ DENSITY_SCALE = 400.0  # 1/m per unit of softplus(raw): raw 8 is opaque within a
 EMPTY_RAW = -4.0  # space of no more raw density than this is empty, by definition
 EMPTY_DENSITY = math.log1p(math.exp(EMPTY_RAW))  # per DENSITY_SCALE; taken off all densities
 HUGE = 1e30
-TINY_M = 1e-6  # what a ray steps over where rounding would keep it in place
+TINY_M = 1e-9  # what a ray steps over where rounding would keep it in place
+BOX_STEP_M = 1e-6  # the same where rounding has put it just outside the grid
 
 
 class GridTables(NamedTuple):
@@ -151,45 +152,6 @@ def row_of(grid, i, j, k):
 
 
 @device
-def voxel_corners(grid, i, j, k):
-    """Raw density of the 8 nodes of a voxel; the void's if i < 0."""
-    if i < 0:
-        return VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW, VOID_RAW
-    values = grid.values
-    if (i & 3) < 3 and (j & 3) < 3 and (k & 3) < 3:
-        row = row_of(grid, i, j, k)
-        return (
-            values[row, 0], values[row + 1, 0], values[row + 4, 0], values[row + 5, 0],
-            values[row + 16, 0], values[row + 17, 0], values[row + 20, 0], values[row + 21, 0],
-        )  # fmt: skip
-    return (
-        values[row_of(grid, i, j, k), 0],
-        values[row_of(grid, i, j, k + 1), 0],
-        values[row_of(grid, i, j + 1, k), 0],
-        values[row_of(grid, i, j + 1, k + 1), 0],
-        values[row_of(grid, i + 1, j, k), 0],
-        values[row_of(grid, i + 1, j, k + 1), 0],
-        values[row_of(grid, i + 1, j + 1, k), 0],
-        values[row_of(grid, i + 1, j + 1, k + 1), 0],
-    )
-
-
-@device
-def raw_density(grid, x, y, z):
-    """Raw density at a canonical place in voxels; the void's outside the grid."""
-    i, j, k = voxel_of(grid, x, y, z)
-    if i < 0:
-        return VOID_RAW
-    fx, fy, fz = x - i, y - j, z - k
-    total = 0.0
-    for c in range(8):
-        row = row_of(grid, i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1))
-        w = (fx if c & 4 else 1 - fx) * (fy if c & 2 else 1 - fy) * (fz if c & 1 else 1 - fz)
-        total += w * grid.values[row, 0]
-    return total
-
-
-@device
 def raw_colour(grid, x, y, z):
     """Raw red, green and blue at a canonical place in voxels."""
     i, j, k = voxel_of(grid, x, y, z)
@@ -290,8 +252,12 @@ def next_octant(warp, pose, ray, t, far, skipping):
     while t < far:
         px, py, pz = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
         i, j, k = int(px), int(py), int(pz)
-        if px < 0 or py < 0 or pz < 0 or i >= nx or j >= ny or k >= nz:
-            t += TINY_M  # rounding at the box's faces
+        # on a face, a ray is on the side it is going to
+        i -= px == i and ray[3] < 0
+        j -= py == j and ray[4] < 0
+        k -= pz == k and ray[5] < 0
+        if px < 0 or py < 0 or pz < 0 or i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
+            t += BOX_STEP_M
             continue
         found = -1
         fx, fy, fz = px - i, py - j, pz - k
@@ -307,7 +273,9 @@ def next_octant(warp, pose, ray, t, far, skipping):
                 low_x, low_y, low_z = 1.0 * i, 1.0 * j, 1.0 * k
                 size = 1.0
             else:
-                high_x, high_y, high_z = fx >= 0.5, fy >= 0.5, fz >= 0.5
+                high_x = fx > 0.5 or (fx == 0.5 and not ray[3] < 0)
+                high_y = fy > 0.5 or (fy == 0.5 and not ray[4] < 0)
+                high_z = fz > 0.5 or (fz == 0.5 and not ray[5] < 0)
                 low_x, low_y, low_z = i + 0.5 * high_x, j + 0.5 * high_y, k + 0.5 * high_z
                 size = 0.5
                 if cell < 0:

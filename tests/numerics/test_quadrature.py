@@ -1,36 +1,15 @@
-"""Cases 15 and 17 to 24 and 28: from densities along a ray to a colour."""
+"""Cases 15, 20 to 24 and 28: from densities along a ray to a colour."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from scipy.special import ndtr
 
 from ntop.conventions import ConfigError, DataError
 from ntop.field import rendering, twin
 from ntop.field.rendering import RenderSettings, trace_rays
-from tests.numerics.scenes import (
-    EXACT,
-    cone,
-    density_of,
-    order,
-    posed_field,
-    raw_of,
-    rms,
-    sigmoid,
-)
-
-DEFAULT_STEP_M = RenderSettings().step_m
-
-
-def exact(step_m, **changes):
-    return RenderSettings(step_m=step_m, **(EXACT | changes))
-
-
-def composed(tau, colour, dtype=torch.float64):
-    """The specification's compositing of numpy arrays (rays, samples[, 3])."""
-    return twin.composite(torch.from_numpy(tau).to(dtype), torch.from_numpy(colour).to(dtype))
+from tests.numerics.scenes import DEFAULT_STEP_M, composed, cone, exact, posed_field, raw_of
 
 
 def humannerf(tau, colour, dtype):
@@ -71,186 +50,6 @@ def test_15_scaling_a_direction_changes_nothing(margin, monkeypatch):
     monkeypatch.setattr(rendering, "unit_directions", lambda _, given: np.ascontiguousarray(given))
     mutant = trace_rays(posed, centre, 318.0 * directions, settings=settings)
     margin.mutant_exceeds("rgb, abs(d) ignored", np.abs(mutant.rgb - unit.rgb).max(), 1e-5)
-
-
-def test_17_a_homogeneous_sphere_has_the_opacity_of_its_chord(margin):
-    density, radius = 31.0, 0.05
-    generator = np.random.default_rng(0)
-    impact = radius * generator.random(500)
-    chord = 2 * np.sqrt(radius**2 - impact**2)
-    truth = -np.expm1(-density * chord)
-    for samples in (1, 7, 512):
-        tau = np.repeat((density * chord / samples)[:, None], samples, 1)
-        clipped = composed(tau, np.ones((*tau.shape, 3)), torch.float32)
-        margin.at_most(
-            "clipped, fp32", np.abs(clipped.opacity.double().numpy() - truth).max(), 1e-6
-        )
-    # the mutant closes the last interval at 1e10 m, as HumanNeRF does
-    tau = np.repeat((density * chord / 64)[:, None], 64, 1)
-    tau[:, -1] = density * 1e10
-    endless = composed(tau, np.ones((*tau.shape, 3))).opacity.numpy()
-    margin.mutant_exceeds("last interval 1e10 long", np.abs(endless - truth).max(), 1e-6)
-    # unclipped: the same ball as a jump between two nodes, which no step resolves; rays are cut at
-    # the faces of voxels, so the error does not grow with the step
-    middle = np.full(3, 0.06)
-    posed = posed_field(
-        lambda p: np.where(
-            np.linalg.norm(p - middle, axis=1) < radius, raw_of(np.array(density)), -12.0
-        ),
-        size_m=(0.12, 0.12, 0.12),
-        voxel_m=0.001,
-    )
-    centre, directions = cone(middle, distance_m=0.7, spread_m=0.05, count=2000)
-    fine = trace_rays(posed, centre, directions, settings=exact(0.00025)).alpha
-    errors = [
-        rms(trace_rays(posed, centre, directions, settings=exact(step)).alpha - fine)
-        for step in (0.016, 0.008, 0.004)
-    ]
-    margin.at_most("unclipped, any step", max(errors), 1e-3)
-
-
-WIDTH_M, BLOB_DEPTH = 0.04, 2.0  # a Gaussian blob and its optical depth through the middle
-
-
-def blob_scene(voxel_m=0.001):
-    """A thin column through a Gaussian blob; its colour changes along the way."""
-    size = (0.024, 0.024, 0.424)
-    middle = np.array(size) / 2
-    peak = BLOB_DEPTH / (WIDTH_M * math.sqrt(2 * math.pi))
-
-    def raw(points):
-        squared = ((points - middle) ** 2).sum(1)
-        return raw_of(peak * np.exp(-squared / (2 * WIDTH_M**2)))
-
-    posed = posed_field(
-        raw,
-        size_m=size,
-        voxel_m=voxel_m,
-        colour=lambda p: np.repeat(20 * (p - middle)[:, 2:], 3, 1),
-    )
-    return posed, middle, peak
-
-
-def blob_truth(directions, *, distance_m, peak):
-    """Opacity in closed form; colour as the blob's own integral over its optical depth."""
-    closest = distance_m * directions[:, 2]  # length to the point nearest the middle
-    impact2 = distance_m**2 - closest**2
-    total = BLOB_DEPTH * np.exp(-impact2 / (2 * WIDTH_M**2))
-    t = np.linspace(-5.3 * WIDTH_M, 5.3 * WIDTH_M, 8001)
-    density = peak * np.exp(-(t**2 + impact2[:, None]) / (2 * WIDTH_M**2))
-    before = total[:, None] * ndtr(t / WIDTH_M)
-    colour = sigmoid(20 * ((closest[:, None] + t) * directions[:, 2:] - distance_m))
-    seen = np.trapezoid(np.exp(-before) * density * colour, t, axis=1)
-    return -np.expm1(-total), seen
-
-
-def test_18_a_gaussian_blob_converges_with_the_second_order(margin):
-    posed, middle, peak = blob_scene()
-    distance = 0.9
-    centre, directions = cone(middle, distance_m=distance, spread_m=0.008, count=300)
-    alpha, colour = blob_truth(directions.numpy(), distance_m=distance, peak=peak)
-    seen = trace_rays(posed, centre, directions, settings=exact(DEFAULT_STEP_M))
-    margin.at_most("alpha at the default step", np.abs(seen.alpha - alpha).max(), 1e-4)
-    margin.at_most("colour at the default step", np.abs(seen.rgb[:, 0] - colour).max(), 1e-4)
-    # between the faces of voxels, so in large ones
-    posed, middle, _ = blob_scene(voxel_m=0.064)
-    fine = trace_rays(posed, centre, directions, settings=exact(0.0005)).rgb
-    errors = [
-        rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb - fine)
-        for step in (0.004, 0.002, 0.001)
-    ]
-    # the rule's order is 2; faces of octants, which do not move with the step, hide a part of it
-    margin.at_least("order of the rule", order(errors), 1.8)
-
-
-def slab_rule(rule, samples, *, start=0.0):
-    """Rms colour error of a rule on a soft slab over 60 phases, compositing as specified.
-
-    The slab (200/m) begins softly within a centimetre, a metre into a 2 m ray.
-    """
-    length = 2.0
-    h = (length - start) / samples
-    surface = 1 + h * (np.arange(60) / 60)[:, None]
-
-    def density(t):
-        return 200 * ndtr((t - surface) / 0.01)
-
-    def colour(t):
-        return np.repeat(sigmoid(30 * (t - surface))[..., None], 3, -1)
-
-    t = start + h * np.arange(samples)[None]
-    middle = t + h / 2
-    if rule == "left":
-        tau, at = h * density(t), t
-    elif rule == "middle":
-        tau, at = h * density(middle), middle
-    else:
-        gauss = h / (2 * math.sqrt(3))
-        tau, at = h / 2 * (density(middle - gauss) + density(middle + gauss)), middle
-    seen = composed(tau, colour(np.broadcast_to(at, (60, samples))))
-    return seen.rgb.numpy(), surface
-
-
-def slab_errors(rule, counts, *, start=0.0):
-    found = []
-    for count in counts:
-        # the truth belongs to the same phases: surfaces follow the coarse step
-        fine, _ = slab_truth(count, start)
-        found.append(rms(slab_rule(rule, count, start=start)[0] - fine))
-    return found
-
-
-def slab_truth(count, start, samples=16384):
-    length = 2.0
-    surface = 1 + (length - start) / count * (np.arange(60) / 60)[:, None]
-    h = (length - start) / samples
-    t = start + h * (np.arange(samples) + 0.5)[None]
-    tau = 200 * ndtr((t - surface) / 0.01) * h
-    colour = np.repeat(sigmoid(30 * (t - surface))[..., None], 3, -1)
-    return composed(tau, colour).rgb.numpy(), surface
-
-
-def test_19_a_soft_slab_converges_and_two_densities_beat_one(margin):
-    counts = (128, 256, 512)
-    left, middle = slab_errors("left", counts), slab_errors("middle", counts)
-    gauss = slab_errors("gauss", counts)
-    margin.at_least("order, midpoint", order(middle), 1.9)
-    margin.at_least("left over Gauss-2 at N=128", left[0] / gauss[0], 5)
-    # a ray that starts inside the slab has an end that does not vanish: left falls to order one
-    inside = slab_errors("left", counts, start=1.02)
-    margin.at_least(
-        "order from inside, midpoint", order(slab_errors("middle", counts, start=1.02)), 1.9
-    )
-    margin.mutant_exceeds("2 - order of the left rule from inside", 2 - order(inside), 0.1)
-
-    # the renderer's own rule, on a slab behind its interface
-    size = (0.06, 0.06, 0.12)
-    depth = np.arange(0, 0.1241, 0.002)
-
-    def raw(z):
-        return raw_of(200 * ndtr((z - 0.05) / 0.01))
-
-    posed = posed_field(
-        lambda p: raw(p[:, 2]), size_m=size, voxel_m=0.002,
-        colour=lambda p: np.repeat(30 * (p[:, 2:] - 0.05), 3, 1),
-    )  # fmt: skip
-    distance = 0.8
-    centre, directions = cone(
-        np.array([0.03, 0.03, 0.05]), distance_m=distance, spread_m=0.02, count=200
-    )
-    z = np.linspace(0, 0.12, 24001)
-    slope = directions.numpy()[:, 2:]
-    tau = density_of(np.interp(z, depth, raw(depth))) / slope
-    before = np.concatenate(
-        [np.zeros((len(slope), 1)), np.cumsum((tau[:, 1:] + tau[:, :-1]) / 2 * z[1], 1)], 1
-    )
-    truth = np.trapezoid(np.exp(-before) * tau * sigmoid(30 * (z - 0.05)), z, axis=1)
-    errors = [
-        rms(trace_rays(posed, centre, directions, settings=exact(step)).rgb[:, 0] - truth)
-        for step in (0.016, 0.008, 0.004)
-    ]
-    # a piece never reaches over a face of a voxel, so steps longer than a voxel cost nothing
-    margin.at_most("colour at any step", max(errors), 1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

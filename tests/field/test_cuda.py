@@ -17,6 +17,7 @@ from numba import cuda
 from ntop.field import twin
 from ntop.field.canonical import Occupancy, PartLabels
 from ntop.field.checkpoints import TrainingState
+from ntop.field.kernels.tables import TINY_M
 from ntop.field.learners import CpuLearner, StepRule
 from ntop.field.marching import MarchRule, Rays, march_on_cpu
 from ntop.field.packing import packed_scene
@@ -31,6 +32,9 @@ from tests.field.test_kernels import light_of, twin_field
 ROOT = Path(__file__).parents[2]
 MARCHED, TRAINED = 24, 12
 STEP_M = 0.01
+# of colours between sheets that disagree, as the CPU's own when directions change by an ulp: 1.1e-5
+# of 20,000 rays with steps of a micrometre over faces, 6e-8 with steps of a nanometre
+JUMPS = max(1e-6, 10 * TINY_M)
 SIMULATED = {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1", "CUDA_VISIBLE_DEVICES": "0"}
 RULE = StepRule(
     step_m=STEP_M, stop=0.0, matte_weight=0.5, entropy_weight=0.03,
@@ -128,11 +132,12 @@ def test_marched_rays_equal_the_cpu_kernels(computed):
     expected, got = march_on_cpu(*cases["march"]), found["march"]
     assert found["words"].startswith("GPU kernels on ")
     assert (expected.opacity > 0.5).mean() > 0.3
-    # rounding decides at a face whether a ray crosses it now or a micrometre later, and so where a
-    # piece of it takes its colour
+    # rounding decides at a face whether a ray crosses it now or `TINY_M` later; where every other
+    # cell has a second sheet of other colours, these jump there
     off = np.abs(got.colours - expected.colours).max(1)
-    assert np.median(off) < 1e-6
-    assert off.max() < 1e-5
+    one_sheet = cases["march"][1].poses == 0
+    assert off[one_sheet].max() < 1e-6
+    assert off.max() < JUMPS
     assert np.abs(got.opacity - expected.opacity).max() < 1e-6
     assert np.abs(got.depth_m - expected.depth_m).max() < 1e-6
     assert (got.parts == expected.parts).all()
@@ -146,7 +151,8 @@ def test_a_view_equals_the_cpus(computed):
     expected, got = render_view(posed, camera, settings=settings), found["view"]
     assert (expected.alpha > 0.5).sum() > 5
     assert np.abs(got.alpha - expected.alpha).max() < 1e-6
-    assert np.abs(got.rgb - expected.rgb).max() < 1e-5  # straight colour divides by alpha
+    light, expected_light = (view.rgb * view.alpha[..., None] for view in (got, expected))
+    assert np.abs(light - expected_light).max() < JUMPS
     assert (got.parts == expected.parts).all()
 
 

@@ -20,7 +20,8 @@ from ntop.storage.renders import body_columns, fisheye_camera, render_row
 from ntop.storage.tables import read_table, write_table
 
 BOTH = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["f32", "f64"])
-HALF_LEVEL = 0.5 / 255 * (1 + 1e-5)  # and one float32 rounding of a value below one
+# and one rounding of a value below 255 in the render's own type
+HALF_LEVEL = {dtype: 0.5 / 255 + np.finfo(dtype).eps for dtype in (np.float32, np.float64)}
 SIZE = 96
 
 
@@ -49,12 +50,14 @@ def test_38_a_stored_picture_is_half_a_level_from_the_render(tmp_path, dtype, ma
     rgb, alpha = person(dtype)
     kept = stored(rgb, alpha, tmp_path)
     inside = kept[..., 3] > 0
-    margin.at_most("alpha", largest(kept[..., 3] - alpha), HALF_LEVEL)
-    margin.at_most("colour where alpha > 0", largest((kept[..., :3] - rgb)[inside]), HALF_LEVEL)
+    margin.at_most("alpha", largest(kept[..., 3] - alpha), HALF_LEVEL[dtype])
+    margin.at_most(
+        "colour where alpha > 0", largest((kept[..., :3] - rgb)[inside]), HALF_LEVEL[dtype]
+    )
     cut = np.floor(alpha * 255) / 255 - alpha
-    margin.mutant_exceeds("truncated alpha", largest(cut), HALF_LEVEL)
+    margin.mutant_exceeds("truncated alpha", largest(cut), HALF_LEVEL[dtype])
     cut = (np.floor(rgb * 255) / 255 - rgb)[inside]
-    margin.mutant_exceeds("truncated colour", largest(cut), HALF_LEVEL)
+    margin.mutant_exceeds("truncated colour", largest(cut), HALF_LEVEL[dtype])
 
 
 def test_38_rounding_leaves_59_db(tmp_path, margin):
@@ -75,7 +78,7 @@ def test_38_a_stored_matte_is_half_a_level_from_the_matte(tmp_path, dtype, margi
     matte = np.linspace(0, 1, 4000, dtype=dtype).reshape(40, 100)
     write_matte(matte, path=tmp_path / "m.png")
     error = largest(read_matte(tmp_path / "m.png").astype(np.float64) - matte)
-    margin.at_most("matte", error, HALF_LEVEL)
+    margin.at_most("matte", error, HALF_LEVEL[dtype])
 
 
 BACKGROUNDS = {

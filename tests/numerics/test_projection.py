@@ -50,7 +50,7 @@ def round_trip(lens, pixels):
     return torch.where(valid & seen, error, torch.inf), rays
 
 
-@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.values())
+@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.get)
 @pytest.mark.parametrize("focal", FOCALS)
 def test_01_round_trip(focal, precision, margin):
     generator = torch.Generator().manual_seed(0)
@@ -58,9 +58,8 @@ def test_01_round_trip(focal, precision, margin):
     for lens in family(focal):
         ideal = isinstance(lens, Equidistant | Equisolid | Stereographic)
         # at 2000 px per radian one ulp of a stereographic 170 degrees is already 7e-12 px
-        grid, theta = table_1_pixels(
-            lens, precision, extra_degrees=(169.99,) if ideal and focal < 1000 else ()
-        )
+        wide = ideal and not (isinstance(lens, Stereographic) and focal > 1000)
+        grid, theta = table_1_pixels(lens, precision, extra_degrees=(169.99,) if wide else ())
         check_round_trip(lens, grid, theta, margin)
         # half an ulp from the rim a ray may round to the other side
         inner = replace(lens, max_theta=lens.max_theta * (1 - 1e-6))
@@ -96,7 +95,7 @@ def check_round_trip(lens, pixels, theta, margin):
         margin.at_most(f"{lens.model} fp32, in ulp(W) x condition", worst, 8)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.values())
+@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.get)
 def test_02_ray_directions_against_50_digits(precision, margin):
     focal, limit = 318.0, {torch.float32: 1e-6, torch.float64: 2e-15}[precision]
     for lens in family(focal):
@@ -141,7 +140,7 @@ def ray_error(lens, pixel, ray):
         )
 
 
-@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.values())
+@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.get)
 def test_03_the_principal_point_and_the_antipode(precision, margin):
     focal = 318.0
     offsets = torch.tensor([0.0, 1e-20, -1e-20, 1e-6, -1e-6], dtype=precision)
@@ -159,7 +158,7 @@ def test_03_the_principal_point_and_the_antipode(precision, margin):
         down = gradients(seen_at, points)[:, 0]
         assert seen.all() and seen_at.isfinite().all()
         error = (down / focal - torch.tensor([1.0, 0.0], dtype=precision)).abs().max().item()
-        margin.at_most(f"{lens.model}: projection gradient / f", error, 1e-5)
+        margin.at_most(f"{lens.model}: projection gradient / f", error, 1e-6)
         behind = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1e-30], [0.0, 0.0, 0.0]])
         behind = behind.to(precision).requires_grad_()
         pixels, seen = lens.project(behind)
@@ -182,7 +181,7 @@ def gradients(values, variables):
     return torch.stack(columns, -1)[:, None]
 
 
-@pytest.mark.parametrize("degrees", [89.99, 90, 90.01, 100, 130, 169.99])
+@pytest.mark.parametrize("degrees", [89.99, 90, 90.01, 100, 130, 170])
 def test_04_azimuth_and_antipodes_around_90_degrees(degrees, margin):
     theta, around, focal = math.radians(degrees), azimuths(400), 318.0
     rays = directions(theta, around)
@@ -191,7 +190,7 @@ def test_04_azimuth_and_antipodes_around_90_degrees(degrees, margin):
         "equisolid": 2 * math.sin(theta / 2),
         "stereographic": 2 * math.tan(theta / 2),
     }
-    for lens in family(focal):
+    for lens in family(focal, max_theta=math.radians(171)):
         if theta > lens.max_theta:
             continue
         r = radius.get(lens.model) or theta * sum(

@@ -4,8 +4,9 @@ A ray marcher's error depends on where between two samples it meets the surface.
 pixel is its depth in steps, so pixels of equal phase are contour lines, and an error that depends
 on it shows as "wood grain". Two detectors (design: NUMERICS section 5):
 
-* phase shift: render twice, samples half a step apart. The error is measured without a reference;
-  half the rms difference was 0.74 of the true error for every step and lens.
+* phase shift: render twice, samples half a step apart. The error is measured without a reference:
+  for samples at equal distances half the rms difference is 0.74 of what varies of it, for every
+  step and lens. Where faces of voxels cut the steps as well it is 0.4 to 0.9 (docs/numerics.md).
 * lock-in: correlate an image with exp(i 2 pi phase). What is not periodic in the phase (texture,
   noise) averages out, so it tells stripes from noise of equal rms, which jitter turns them into.
 """
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 LEVELS = 255.0
-MAX_PHASE_SHIFT = 0.37  # grey levels; times 1.35 it is an error of 0.5 levels
+MAX_PHASE_SHIFT = 0.37  # grey levels; of equal steps, times 1.35, an error of 0.5 levels
 MAX_Z = 4.0
 MAX_AMPLITUDE = 0.1  # grey levels
 MIN_PIXELS = 500

@@ -132,8 +132,8 @@ def test_marched_rays_equal_the_cpu_kernels(computed):
     expected, got = march_on_cpu(*cases["march"]), found["march"]
     assert found["words"].startswith("GPU kernels on ")
     assert (expected.opacity > 0.5).mean() > 0.3
-    # rounding decides at a face whether a ray crosses it now or `TINY_M` later; where every other
-    # cell has a second sheet of other colours, these jump there
+    # rounding decides at a face whether a ray is over it or goes on by `TINY_M` in the old octant;
+    # where every other cell has a second sheet of other colours, these jump there
     off = np.abs(got.colours - expected.colours).max(1)
     one_sheet = cases["march"][1].poses == 0
     assert off[one_sheet].max() < 1e-6

@@ -351,7 +351,7 @@ def test_33_where_blending_collapses_the_map_is_a_rigid_bone(name, margin):
 
 
 # what 12 mm cells with two correspondences cost: (95 %, shares of points beyond 0.1 and 10 mm);
-# at hard bends both sides of the fold lie in one cell, and one of them is lost
+# at hard bends a cell's corners may all find one side of a fold, and the other is lost
 GRID_LIMITS_MM = {
     "elbow 30": (0.5, 0.25, 0.0),
     "elbow 60": (1.0, 0.35, 0.0),

@@ -37,9 +37,10 @@ PAUSE_S = (0.2, 0.5)  # random, so that two leases do not try in step for ever
 def main(*command: str, n: int, timeout_s: float | None = None) -> None:
     """Become `command` while holding `n` GPUs; their ids are its CUDA_VISIBLE_DEVICES.
 
-    With `n` = 0, or inside a SLURM job (whose GPUs are already its own), the command runs
-    untouched. Otherwise waits for free GPUs, at most `timeout_s` seconds; without it, as long as
-    it takes. Does not return: the command takes this process's place, signals and exit code.
+    With `n` = 0 it is empty, which hides all GPUs, and inside a SLURM job (whose GPUs are already
+    its own) it stays as it is. Otherwise waits for free GPUs, at most `timeout_s` seconds; without
+    it, as long as it takes. Does not return: the command takes this process's place, signals and
+    exit code.
 
     Raises:
         ConfigError: `n` is negative, larger than the pool, or a variable makes no sense.
@@ -47,7 +48,9 @@ def main(*command: str, n: int, timeout_s: float | None = None) -> None:
     """
     if n < 0:
         raise ConfigError(f"-n {n}: expected the number of GPUs, 0 or more")
-    if n > 0 and SLURM_VARIABLE not in os.environ:
+    if n == 0:
+        hide_gpus()
+    elif SLURM_VARIABLE not in os.environ:
         pool, sharing = gpu_pool(), jobs_per_gpu()
         if len(pool.ids) < n:
             raise ConfigError(
@@ -61,14 +64,31 @@ def main(*command: str, n: int, timeout_s: float | None = None) -> None:
         os.environ["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
         for descriptor in lease.descriptors:
             os.set_inheritable(descriptor, True)
-        sys.stderr.write(f"leased GPU {','.join(lease.ids)}\n")
-        sys.stderr.flush()
+        _say(f"leased GPU {','.join(lease.ids)}")
     try:
         os.execvp(command[0], command)
     except OSError as error:
         raise DataError(
             f"cannot run {command[0]!r}: {error.strerror}; check its name and PATH"
         ) from error
+
+
+def hide_gpus() -> None:
+    """Let this process's programs see no GPU, and say so where the environment gave it one.
+
+    Empty, not `-1`, which is an index that CUDA merely does not find: "If the variable is set to an
+    empty string, no GPU devices are visible" (CUDA Programming Guide, Environment Variables).
+    """
+    inherited = os.environ.get(VISIBLE_VARIABLE, "")
+    os.environ[VISIBLE_VARIABLE] = ""
+    if inherited and not inherited.startswith("-"):
+        _say(f"GPU {inherited} hidden: this job asked for none")
+
+
+def _say(words: str) -> None:
+    """A line for the job's log, out before another program takes this process's place."""
+    sys.stderr.write(f"{words}\n")
+    sys.stderr.flush()
 
 
 @dataclass(frozen=True)
@@ -175,8 +195,7 @@ def wait_for_gpus(
                 "--timeout-s"
             )
         if not told:
-            sys.stderr.write(f"waiting for {n} free GPUs of {','.join(ids)}\n")
-            sys.stderr.flush()
+            _say(f"waiting for {n} free GPUs of {','.join(ids)}")
             told = True
         time.sleep(random.uniform(*PAUSE_S))
 

@@ -142,17 +142,41 @@ def test_a_pool_that_is_too_small_names_both_numbers(machine):
     assert "3 GPUs wanted, but the pool has 2 (NTOP_GPU_IDS: 0,1)" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("flags", "environment"),
-    [
-        (["-n", "1"], {"SLURM_JOB_ID": "17", "CUDA_VISIBLE_DEVICES": "2"}),
-        (["-n", "0"], {"CUDA_VISIBLE_DEVICES": "2"}),
-    ],
-)
-def test_slurm_and_no_gpu_leave_the_command_untouched(machine, flags, environment):
-    done = machine.run(*flags, "--", *SHOW, NTOP_GPU_IDS="0,1", **environment)
+def test_slurms_gpus_stay_as_they_are(machine):
+    environment = {"SLURM_JOB_ID": "17", "CUDA_VISIBLE_DEVICES": "2"}
+    done = machine.run("-n", "1", "--", *SHOW, NTOP_GPU_IDS="0,1", **environment)
     assert (done.returncode, done.stdout, done.stderr) == (0, "2 unset\n", "")
     assert not machine.locks.exists()
+
+
+@pytest.mark.parametrize(
+    ("inherited", "said"),
+    [
+        ({}, ""),
+        ({"CUDA_VISIBLE_DEVICES": ""}, ""),
+        ({"CUDA_VISIBLE_DEVICES": "-1"}, ""),
+        ({"CUDA_VISIBLE_DEVICES": "2,5"}, "GPU 2,5 hidden: this job asked for none\n"),
+        (
+            {"CUDA_VISIBLE_DEVICES": "2", "SLURM_JOB_ID": "17"},
+            "GPU 2 hidden: this job asked for none\n",
+        ),
+    ],
+)
+def test_who_asks_for_no_gpu_sees_none(machine, inherited, said):
+    see = [sys.executable, "-c", "import os; print(repr(os.environ['CUDA_VISIBLE_DEVICES']))"]
+    done = machine.run("-n", "0", "--", *see, NTOP_GPU_IDS="0,1", **inherited)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "''\n", said)
+    assert not machine.locks.exists()
+
+
+def test_torch_and_the_kernels_find_no_gpu_where_all_are_hidden(machine):
+    see = (
+        "import torch; from ntop.field.devices import kernel_words;"
+        "print(torch.cuda.device_count(), kernel_words())"
+    )
+    done = machine.run("-n", "0", "--", sys.executable, "-c", see, CUDA_VISIBLE_DEVICES="0")
+    assert done.stdout.startswith("0 CPU kernels on "), done.stderr
+    assert done.stdout.endswith("this job has no GPU\n")
 
 
 def test_no_gpu_is_needed_for_none(machine, tmp_path):

@@ -168,15 +168,37 @@ def _require_finite(
     light: Float[np.ndarray, "9 3"],
     betas: tuple[float, ...],
 ) -> None:
-    """Refuse an avatar that a diverged training left: one NaN would spread over whole pixels."""
     lengths = np.array([header["voxel_m"], header["reach_m"]], float)
-    bad = {
-        "values": int((~np.isfinite(stored)).sum()),
-        "light": int((~np.isfinite(light)).sum()),
-        "betas": int((~np.isfinite(betas)).sum()),
-        "origin_m": int((~np.isfinite(np.array(header["origin_m"], float))).sum()),
-        "lengths": int((~(np.isfinite(lengths) & (lengths > 0))).sum()),
-    }
+    refuse_diverged(
+        folder,
+        {
+            "values": not_finite(stored),
+            "light": not_finite(light),
+            "betas": not_finite(betas),
+            "origin_m": not_finite(np.array(header["origin_m"], float)),
+            "lengths": not_positive(lengths),
+        },
+    )
+
+
+def not_finite(values: Any) -> int:
+    """How many of some numbers are NaN or infinite."""
+    return int((~np.isfinite(np.asarray(values))).sum())
+
+
+def not_positive(values: Float[np.ndarray, "..."]) -> int:
+    """How many of some numbers are not positive, NaN or infinite."""
+    return int((~(np.isfinite(values) & (values > 0))).sum())
+
+
+def refuse_diverged(folder: Path, bad: dict[str, int]) -> None:
+    """Refuse an avatar that a diverged training left: one NaN would spread over whole pixels.
+
+    `bad` counts what `not_finite` and `not_positive` found, by the name of what was searched.
+
+    Raises:
+        DataError: they found anything.
+    """
     if any(bad.values()):
         found = ", ".join(f"{count} in {name}" for name, count in bad.items() if count)
         raise DataError(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from copy import deepcopy
 from dataclasses import replace
 from itertools import chain, repeat
 
@@ -278,6 +279,42 @@ def photograph(views, view):
     rgba = np.zeros((lens.height, lens.width, 4), np.uint8)
     rgba[top : top + height, left : left + width] = views.crops[view]
     return Cutout.from_rgba(rgba)
+
+
+@pytest.fixture(scope="module")
+def untrained(views, model):
+    with HumanNerfTrainer(views, model, shape(views), settings=SETTINGS) as trainer:
+        return trainer.avatar()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"canonical": math.nan}, "1 in canonical"),
+        ({"non_rigid": math.inf}, "1 in non_rigid"),
+        ({"volume": -math.inf}, "1 in volume"),
+        ({"betas": (math.nan, *BETAS[1:])}, "1 in betas"),
+        ({"open_bands": math.nan}, "1 in open_bands"),
+        ({"weight_floor": math.nan}, "1 in weight_floor"),
+        ({"box": Box(np.zeros(3), np.array([1.0, math.inf, 1.0]))}, "1 in box"),
+        ({"box": Box(np.zeros(3), np.array([1.0, 0.0, 1.0]))}, "1 in box"),
+        ({}, ""),
+    ],
+)
+def test_an_avatar_of_a_diverged_training_is_refused(untrained, tmp_path, change, message):
+    change = dict(change)
+    for name in {"canonical", "non_rigid", "volume"} & set(change):
+        part = deepcopy(getattr(untrained, name))
+        with torch.no_grad():
+            array = part if name == "volume" else next(part.parameters())
+            array.flatten()[3] = change[name]
+        change[name] = part
+    save_avatar(replace(untrained, **change), tmp_path, write=write)
+    if not message:
+        load_avatar(tmp_path)
+        return
+    with pytest.raises(DataError, match=f"{message}; its training diverged, train it again"):
+        load_avatar(tmp_path)
 
 
 def run(verb, config, **flags):

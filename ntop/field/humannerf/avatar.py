@@ -11,7 +11,13 @@ from jaxtyping import Float
 from safetensors import SafetensorError
 
 from ntop.conventions import NUM_BETAS, DataError
-from ntop.field.avatar import AvatarFiles, write_avatar_files
+from ntop.field.avatar import (
+    AvatarFiles,
+    not_finite,
+    not_positive,
+    refuse_diverged,
+    write_avatar_files,
+)
 from ntop.field.humannerf.field import ActorField
 from ntop.field.humannerf.networks import Architecture, CanonicalField, NonRigidMotion, hann_windows
 from ntop.field.humannerf.skeleton import Box
@@ -96,7 +102,8 @@ def humannerf_from_files(files: AvatarFiles) -> HumanNerfAvatar:
     """The avatar of files whose header says that they are the twin's.
 
     Raises:
-        DataError: arrays are missing or have the wrong shape.
+        DataError: arrays are missing or have the wrong shape, a number is not finite, or the box
+            is empty.
     """
     header = files.header
     try:
@@ -130,4 +137,14 @@ def humannerf_from_files(files: AvatarFiles) -> HumanNerfAvatar:
         raise DataError(
             f"avatar {files.folder}: {len(betas)} betas, expected {NUM_BETAS}; train it again"
         )
+    weights = {name: network.state_dict().values() for name, network in networks.items()}
+    weights["volume"] = [avatar.volume]
+    bad = {name: sum(map(not_finite, tensors)) for name, tensors in weights.items()}
+    bad |= {
+        "betas": not_finite(betas),
+        "box": not_finite(avatar.box.low) + not_positive(avatar.box.high - avatar.box.low),
+        "open_bands": not_finite(avatar.open_bands or 0.0),
+        "weight_floor": not_finite(avatar.weight_floor),
+    }
+    refuse_diverged(files.folder, bad)
     return avatar

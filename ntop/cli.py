@@ -21,7 +21,7 @@ from ntop.config.base import explain
 from ntop.conventions import ConfigError, NtopError
 from ntop.stages import STAGES, VERSIONS
 
-TOOLS = ("check", "fetch", "lease", "orphans", "plan", "status", "stripes")
+TOOLS = ("check", "fetch", "lease", "lens", "orphans", "plan", "status", "stripes")
 EXIT_USER_ERROR = 2
 
 

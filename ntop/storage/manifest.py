@@ -9,11 +9,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from ntop.conventions import DataError
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import set_key
-from ntop.storage.tables import Row, completed
+from ntop.storage.tables import Row, completed, open_table
 
 ROWS_PER_GROUP = 4096  # a row takes about 10 kB in memory
 
@@ -65,21 +64,7 @@ class ManifestReader:
         Raises:
             DataError: the file is missing, damaged, or has other columns than expected.
         """
-        path = folder / MANIFEST_NAME
-        try:
-            self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise DataError(
-                f"cannot read table {path}: {error}; delete it and rerun the assemble stage"
-            ) from error
-        names = self._file.schema_arrow.names
-        if completed(self._file.schema_arrow.empty_table(), schemas.MANIFEST).schema.names != (
-            schemas.MANIFEST.names
-        ):
-            raise DataError(
-                f"{path}: columns {names}, expected "
-                f"{schemas.MANIFEST.names}; it was written by another version: rerun assemble"
-            )
+        self._file = open_table(folder / MANIFEST_NAME, schema=schemas.MANIFEST)
 
     @property
     def num_rows(self) -> int:

@@ -8,7 +8,7 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, coco17_points, pose_body
 from ntop.conventions import DataError
 from ntop.geometry.cameras import Camera
-from ntop.geometry.fisheyes import fisheye_lens
+from ntop.geometry.fisheyes import Fisheye, fisheye_lens
 from ntop.geometry.kannala_brandt import KannalaBrandt
 from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigs import Rig
@@ -17,6 +17,10 @@ from ntop.storage.tables import Row
 
 NO_BACKGROUND = "none"  # the image is transparent where the person is not
 IMAGE_FOLDERS = {"image_path": "images", "depth_path": "depth", "parts_path": "parts"}
+LENS_KEYS = (
+    "camera_model", "width", "height", "focal_px", "cx_px", "cy_px", "max_theta_rad",
+    "focal_y_px", "distortion",
+)  # fmt: skip
 
 
 def body_columns(model: BodyModel, pose: BodyPose) -> Row:
@@ -107,25 +111,30 @@ def set_key(row: Row) -> SetKey:
 
 
 def fisheye_camera(row: dict[str, Any]) -> Camera:
-    """The camera of a row of a render table, a manifest or a set file (float64).
+    """The camera of a row of a render table, a manifest or a set file (float64)."""
+    return Camera(
+        lens=row_lens(row),
+        center_world=torch.tensor(row["center_world_m"], dtype=torch.float64),
+        rotation=torch.tensor(row["rotation_camera_from_world"], dtype=torch.float64).reshape(3, 3),
+    )
+
+
+def row_lens(row: dict[str, Any]) -> Fisheye:
+    """The lens of such a row, of which the columns LENS_KEYS are enough.
 
     Tables made before lenses could differ lack the last two columns: they are equidistant.
 
     Raises:
         DataError: an unknown lens model, or parameters that it cannot have.
     """
-    return Camera(
-        lens=fisheye_lens(
-            row["camera_model"],
-            fx=row["focal_px"],
-            fy=row.get("focal_y_px") or row["focal_px"],
-            cx=row["cx_px"],
-            cy=row["cy_px"],
-            width=row["width"],
-            height=row["height"],
-            max_theta=row["max_theta_rad"],
-            distortion=tuple(row.get("distortion") or ()),
-        ),
-        center_world=torch.tensor(row["center_world_m"], dtype=torch.float64),
-        rotation=torch.tensor(row["rotation_camera_from_world"], dtype=torch.float64).reshape(3, 3),
+    return fisheye_lens(
+        row["camera_model"],
+        fx=row["focal_px"],
+        fy=row.get("focal_y_px") or row["focal_px"],
+        cx=row["cx_px"],
+        cy=row["cy_px"],
+        width=row["width"],
+        height=row["height"],
+        max_theta=row["max_theta_rad"],
+        distortion=tuple(row.get("distortion") or ()),
     )

@@ -1,5 +1,6 @@
 """Parquet tables: explicit schema, sorted rows, checked on reading."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,42 @@ def load_table(path: Path, *, schema: pa.Schema) -> pa.Table:
             f"it was written by another version: {remedy(path)}"
         )
     return table.cast(schema)
+
+
+def open_table(path: Path, *, schema: pa.Schema) -> pq.ParquetFile:
+    """A table to be read piece by piece, after a check of its columns; see `completed`.
+
+    Raises:
+        DataError: the file is missing or truncated, or has other columns than expected.
+    """
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
+    found = file.schema_arrow
+    if completed(found.empty_table(), schema).schema.names != schema.names:
+        raise DataError(
+            f"{path}: columns {found.names}, expected {schema.names}; it was written by another "
+            f"version: {remedy(path)}"
+        )
+    return file
+
+
+def read_columns(path: Path, names: Sequence[str], *, schema: pa.Schema) -> Iterator[Row]:
+    """Rows with a few of a table's columns, of which the file may lack those that came later.
+
+    Memory does not grow with the table.
+
+    Raises:
+        DataError: the file is missing, damaged, or has other columns than expected.
+    """
+    with open_table(path, schema=schema) as file:
+        stored = [name for name in names if name in file.schema_arrow.names]
+        try:
+            for batch in file.iter_batches(columns=stored):
+                yield from batch.to_pylist()
+        except (OSError, pa.ArrowInvalid) as error:
+            raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
 
 
 def completed(table: pa.Table, schema: pa.Schema) -> pa.Table:

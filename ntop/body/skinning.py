@@ -25,6 +25,15 @@ class BodyPose:
     body_pose: Float[Tensor, "*batch 69"]
     transl: Float[Tensor, "*batch 3"]
 
+    def double(self) -> "BodyPose":
+        """The same in float64."""
+        return BodyPose(
+            betas=self.betas.double(),
+            global_orient=self.global_orient.double(),
+            body_pose=self.body_pose.double(),
+            transl=self.transl.double(),
+        )
+
 
 @dataclass(frozen=True)
 class PosedBody:

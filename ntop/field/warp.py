@@ -50,12 +50,7 @@ def pose_warp(
     Raises:
         DataError: the pose or shape is not finite, or stretches the body beyond `MAX_NODES`.
     """
-    pose = BodyPose(
-        betas=pose.betas.double(),
-        global_orient=pose.global_orient.double(),
-        body_pose=pose.body_pose.double(),
-        transl=pose.transl.double(),
-    )
+    pose = pose.double()
     posed = pose_body(model, pose)
     vertices_world = posed.vertices.numpy()
     radius = reach_m + 1.8 * cell_m  # a cell's farthest corner

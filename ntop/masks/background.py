@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from ntop.masks.edges import disc
 from ntop.masks.mattes import fill_small_holes
 from ntop.masks.regions import box_around
 
@@ -49,8 +50,7 @@ def _main_parts(
     different: Bool[np.ndarray, "height width"], radius_px: int
 ) -> Bool[np.ndarray, "height width"]:
     """The large connected parts, closed and filled."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
-    closed = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_CLOSE, disc)
+    closed = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_CLOSE, disc(radius_px))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
@@ -65,8 +65,7 @@ def _soft_edges(
     radius_px: int,
 ) -> Float32[np.ndarray, "height width"]:
     """One inside, zero outside, the mixing ratio of person and scene in a band between."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
-    inside = cv2.erode(solid.astype(np.uint8), disc)
+    inside = cv2.erode(solid.astype(np.uint8), disc(radius_px))
     near = cv2.dilate(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     window = (4 * radius_px + 1,) * 2
     weight = cv2.boxFilter(inside.astype(np.float32), -1, window)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from ntop.masks.edges import mixed_edges
+from ntop.masks.edges import disc, mixed_edges
 from ntop.masks.plates import MIN_FRAMES, SHOWS_SCENE, Plate, person_log_odds, with_evidence
 from ntop.masks.regions import box_around
 
@@ -74,8 +74,7 @@ def keep_person(
     person = kept[labels]
     filled = fill_small_holes(person, area_px=round((HOLE_SIDE * radius_px) ** 2))
     # the soft rim belongs to the part it touches
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
-    reach = cv2.dilate(filled.astype(np.uint8), disc) > 0
+    reach = cv2.dilate(filled.astype(np.uint8), disc(radius_px)) > 0
     cleaned = np.where(reach & ~(solid & ~person), matte, 0)
     return np.where(filled & ~person, 1, cleaned).astype(np.float32)
 

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from ntop.masks.edges import disc
+
 SHOWS_SCENE = 0.02  # probability of the person below which a pixel counts as scene
 MIN_FRAMES = 5  # that must show a pixel's scene
 CAMERA_NOISE = 4.0  # of 255: compression and sensor, per channel
@@ -50,8 +52,7 @@ class PlateBuilder:
 
         `person` is the probability of the person in 1/255.
         """
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
-        scene = (cv2.dilate(person, disc) <= round(255 * SHOWS_SCENE)).astype(np.uint8)
+        scene = (cv2.dilate(person, disc(radius_px)) <= round(255 * SHOWS_SCENE)).astype(np.uint8)
         cv2.accumulate(image, self._sum, mask=scene)
         cv2.accumulateSquare(image, self._squares, mask=scene)
         self._frames += scene

@@ -28,14 +28,14 @@ from ntop.storage.files import (
     read_records,
 )
 from ntop.storage.links import link_or_copy
-from ntop.storage.manifest import ManifestWriter, manifest_writer
+from ntop.storage.manifest import manifest_writer
 from ntop.storage.pace import paced
 from ntop.storage.provenance import code_sha256, json_sha256
 from ntop.storage.remedies import FILES_NAME, remedy
 from ntop.storage.renders import set_key
 from ntop.storage.sets import set_record, write_set
 from ntop.storage.shards import PicturePlaces, picture_places
-from ntop.storage.tables import Row, read_table
+from ntop.storage.tables import Row, RowWriter, read_table
 
 SPLITS = ("train", "val")
 COCO_NAMES = {COCO17: "person_keypoints", SMPL24: "person_smpl24"}
@@ -129,7 +129,7 @@ def add_shard(
     *,
     actors: dict[tuple[str, str], Actor],
     folder: Path,
-    manifest: ManifestWriter,
+    manifest: RowWriter,
     coco: dict[tuple[str, str], CocoWriter],
     totals: Totals,
 ) -> list[Row]:
@@ -166,7 +166,7 @@ def add_shard(
                 link_or_copy(shard.renders / source, folder / target)
                 files[target] = record | {"path": target}
             row = manifest_row(render, places, persons=annotated["persons"], split=actor.split)
-            manifest.add(row)
+            manifest.add([row])
             rows.append(row)
             for skeleton, points in (
                 (COCO17, render["coco17_world_m"]),

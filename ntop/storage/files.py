@@ -6,19 +6,16 @@ without a record (made by hand) is taken as it is.
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ntop.conventions import DataError
 from ntop.storage import schemas
 from ntop.storage.provenance import file_sha256
 from ntop.storage.remedies import FILES_NAME, remedy
-from ntop.storage.tables import Row, read_table, write_table
+from ntop.storage.tables import Row, RowWriter, read_table, row_writer, write_table
 
 ROWS_PER_GROUP = 8192
 
@@ -110,36 +107,6 @@ def raise_damage(damage: Damage | None, folder: Path) -> None:
         raise DataError(f"{damage.path} {damage.what}; {remedy(folder)}")
 
 
-class FilesWriter:
-    """Appends to the record of a folder that is too large to be held in memory."""
-
-    def __init__(self, writer: pq.ParquetWriter) -> None:
-        """Write through an open Parquet writer; see `files_writer`."""
-        self._writer = writer
-        self._rows: list[Row] = []
-
-    def add(self, rows: Iterable[Row]) -> None:
-        """Append records."""
-        self._rows.extend(rows)
-        if len(self._rows) >= ROWS_PER_GROUP:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write what is buffered as one row group."""
-        if self._rows:
-            self._writer.write_table(pa.Table.from_pylist(self._rows, schema=schemas.FILE))
-            self._rows = []
-
-
-@contextmanager
-def files_writer(folder: Path) -> Iterator[FilesWriter]:
-    """A writer of a folder's record; the file is whole when the block ends.
-
-    Not atomic: a dataset is built in a work folder and published as a whole.
-    """
-    with pq.ParquetWriter(
-        folder / FILES_NAME, schemas.FILE, compression="zstd", write_page_checksum=True
-    ) as writer:
-        rows = FilesWriter(writer)
-        yield rows
-        rows.flush()
+def files_writer(folder: Path) -> AbstractContextManager[RowWriter]:
+    """A writer of the record of a folder that holds many files; see `row_writer`."""
+    return row_writer(folder / FILES_NAME, schema=schemas.FILE, rows_per_group=ROWS_PER_GROUP)

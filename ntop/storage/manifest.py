@@ -2,17 +2,16 @@
 
 from collections import deque
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import set_key
-from ntop.storage.tables import Row, completed, open_table
+from ntop.storage.tables import Row, RowWriter, completed, open_table, row_writer
 
 ROWS_PER_GROUP = 4096  # a row takes about 10 kB in memory
 
@@ -20,39 +19,10 @@ MANIFEST_NAME = "manifest.parquet"
 SET_COLUMNS = ["source", "actor", "action", "rig", "frame"]
 
 
-class ManifestWriter:
-    """Takes manifest rows in their final order; see `manifest_writer`."""
-
-    def __init__(self, writer: pq.ParquetWriter) -> None:
-        """Write through an open Parquet writer."""
-        self._writer = writer
-        self._rows: list[Row] = []
-
-    def add(self, row: Row) -> None:
-        """Append one row."""
-        self._rows.append(row)
-        if len(self._rows) == ROWS_PER_GROUP:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write what is buffered as one row group."""
-        if self._rows:
-            self._writer.write_table(pa.Table.from_pylist(self._rows, schema=schemas.MANIFEST))
-            self._rows = []
-
-
-@contextmanager
-def manifest_writer(folder: Path) -> Iterator[ManifestWriter]:
-    """A writer of `manifest.parquet` in a dataset's folder; the file is whole when the block ends.
-
-    Not atomic: a dataset is built in a work folder and published as a whole.
-    """
-    with pq.ParquetWriter(
-        folder / MANIFEST_NAME, schemas.MANIFEST, compression="zstd", write_page_checksum=True
-    ) as writer:
-        rows = ManifestWriter(writer)
-        yield rows
-        rows.flush()
+def manifest_writer(folder: Path) -> AbstractContextManager[RowWriter]:
+    """A writer of `manifest.parquet` in a dataset's folder; see `row_writer`."""
+    path = folder / MANIFEST_NAME
+    return row_writer(path, schema=schemas.MANIFEST, rows_per_group=ROWS_PER_GROUP)
 
 
 class ManifestReader:

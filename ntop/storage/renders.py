@@ -32,12 +32,7 @@ def body_columns(model: BodyModel, pose: BodyPose) -> Row:
     Raises:
         DataError: a parameter is not finite, or so large that a joint is not.
     """
-    exact = BodyPose(
-        betas=pose.betas.double(),
-        global_orient=pose.global_orient.double(),
-        body_pose=pose.body_pose.double(),
-        transl=pose.transl.double(),
-    )
+    exact = pose.double()
     body = pose_body(model, exact)
     if not (body.joints.isfinite().all() and exact.betas.isfinite().all()):
         raise DataError(

@@ -18,6 +18,7 @@ def vector(length: int, kind: pa.DataType = FLOAT64) -> pa.DataType:
 
 ACTOR_KEY = [("source", STRING), ("actor", STRING), ("action", STRING), ("frame", INT32)]
 VIEW_KEY = [*ACTOR_KEY, ("view", STRING)]
+RENDER_KEY = [*ACTOR_KEY[:3], ("rig", STRING), *VIEW_KEY[3:]]
 
 # A still image, or one frame of a video: `image_index` is the 0-based frame in `image_path`,
 # -1 for a still. Nothing is re-encoded. `reason` is empty where the frame is usable.
@@ -109,34 +110,34 @@ CURVE = pa.schema(
 # later: a table without them reads as null, which means square pixels and no distortion.
 LENS_COLUMNS = [("focal_y_px", FLOAT64), ("distortion", pa.list_(FLOAT64))]
 
-# One row per rendered view. `alpha_max` is 0 where no body is in view.
+# A rendered view: its files, its camera, its place over the person, and what it was made from.
+IMAGE_COLUMNS = [
+    ("image_path", STRING),
+    ("depth_path", STRING),
+    ("parts_path", STRING),
+    ("image_sha256", STRING),
+    ("width", INT32),
+    ("height", INT32),
+    ("camera_model", STRING),
+    ("focal_px", FLOAT64),
+    ("cx_px", FLOAT64),
+    ("cy_px", FLOAT64),
+    ("max_theta_rad", FLOAT64),
+    ("center_world_m", vector(3)),
+    ("rotation_camera_from_world", vector(9)),
+    ("height_above_pelvis_m", FLOAT64),
+    ("ring_radius_m", FLOAT64),
+    ("seed", INT64),
+    ("avatar_sha256", STRING),
+    ("background_id", STRING),
+]
+
+# One row per rendered view.
 RENDER = pa.schema(
     [
         ("sample_id", STRING),
-        ("source", STRING),
-        ("actor", STRING),
-        ("action", STRING),
-        ("rig", STRING),
-        ("frame", INT32),
-        ("view", STRING),
-        ("image_path", STRING),
-        ("depth_path", STRING),
-        ("parts_path", STRING),
-        ("image_sha256", STRING),
-        ("width", INT32),
-        ("height", INT32),
-        ("camera_model", STRING),
-        ("focal_px", FLOAT64),
-        ("cx_px", FLOAT64),
-        ("cy_px", FLOAT64),
-        ("max_theta_rad", FLOAT64),
-        ("center_world_m", vector(3)),
-        ("rotation_camera_from_world", vector(9)),
-        ("height_above_pelvis_m", FLOAT64),
-        ("ring_radius_m", FLOAT64),
-        ("seed", INT64),
-        ("avatar_sha256", STRING),
-        ("background_id", STRING),
+        *RENDER_KEY,
+        *IMAGE_COLUMNS,
         *BODY_COLUMNS,
         ("joints3d_world_m", vector(3 * NUM_JOINTS)),
         ("coco17_world_m", vector(51)),
@@ -173,24 +174,7 @@ MANIFEST = pa.schema(
         ("rig", STRING),
         ("view", STRING),
         ("frame", INT32),
-        ("image_path", STRING),
-        ("depth_path", STRING),
-        ("parts_path", STRING),
-        ("image_sha256", STRING),
-        ("width", INT32),
-        ("height", INT32),
-        ("camera_model", STRING),
-        ("focal_px", FLOAT64),
-        ("cx_px", FLOAT64),
-        ("cy_px", FLOAT64),
-        ("max_theta_rad", FLOAT64),
-        ("center_world_m", vector(3)),
-        ("rotation_camera_from_world", vector(9)),
-        ("height_above_pelvis_m", FLOAT64),
-        ("ring_radius_m", FLOAT64),
-        ("seed", INT64),
-        ("avatar_sha256", STRING),
-        ("background_id", STRING),
+        *IMAGE_COLUMNS,
         ("persons", pa.list_(PERSON)),
         *LENS_COLUMNS,
     ]

@@ -1,6 +1,7 @@
 """Parquet tables: explicit schema, sorted rows, checked on reading."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,39 @@ def read_columns(path: Path, names: Sequence[str], *, schema: pa.Schema) -> Iter
                 yield from batch.to_pylist()
         except (OSError, pa.ArrowInvalid) as error:
             raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
+
+
+class RowWriter:
+    """Takes rows in their final order and writes them in groups; see `row_writer`."""
+
+    def __init__(self, writer: pq.ParquetWriter, *, rows_per_group: int) -> None:
+        """Write through an open Parquet writer."""
+        self._writer, self._rows_per_group = writer, rows_per_group
+        self._rows: list[Row] = []
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Append rows."""
+        self._rows.extend(rows)
+        if len(self._rows) >= self._rows_per_group:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is buffered as one row group."""
+        if self._rows:
+            self._writer.write_table(pa.Table.from_pylist(self._rows, schema=self._writer.schema))
+            self._rows = []
+
+
+@contextmanager
+def row_writer(path: Path, *, schema: pa.Schema, rows_per_group: int) -> Iterator[RowWriter]:
+    """A writer of a table too large to be held in memory; the file is whole when the block ends.
+
+    Not atomic: a dataset is built in a work folder and published as a whole.
+    """
+    with pq.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
+        rows = RowWriter(writer, rows_per_group=rows_per_group)
+        yield rows
+        rows.flush()
 
 
 def completed(table: pa.Table, schema: pa.Schema) -> pa.Table:

@@ -23,6 +23,7 @@ from ntop.conventions import ConfigError
 from ntop.geometry.cameras import Camera
 from ntop.storage import schemas
 from ntop.storage.atomic import write_bytes
+from ntop.storage.bodies import body_rows
 from ntop.storage.cameras import write_cameras
 from ntop.storage.frames import STILL
 from ntop.storage.images import eight_bit, write_matte
@@ -177,22 +178,15 @@ def _body_rows(given: BodyPose, *, truth: BodyPose, sequence: Sequence, actor: A
     """Rows of schema BODY; the error is that of the noise added."""
     joints = pose_joints(actor.model, given)
     errors_mm = 1000 * (joints - pose_joints(actor.model, truth)).norm(dim=-1).mean(-1)
-    return [
-        {
-            "source": sequence.source,
-            "actor": sequence.actor,
-            "action": sequence.action,
-            "frame": frame,
-            "betas": given.betas[index].tolist(),
-            "global_orient_rad": given.global_orient[index].tolist(),
-            "body_pose_rad": given.body_pose[index].tolist(),
-            "transl_m": given.transl[index].tolist(),
-            "joints3d_world_m": joints[index].flatten().tolist(),
-            "error_mm": errors_mm[index].item(),
-            "reason": "",
-        }
-        for index, frame in enumerate(sequence.frames)
-    ]
+    return body_rows(
+        given,
+        joints,
+        source=sequence.source,
+        actor=sequence.actor,
+        frames=[(sequence.action, frame) for frame in sequence.frames],
+        errors_mm=errors_mm.tolist(),
+        reasons=[""] * len(errors_mm),
+    )
 
 
 def _write_truth(

@@ -24,8 +24,15 @@ def stripes(
     coordinate_m: Float[ndarray, "*point"], *, period_m: float, width_m: float
 ) -> Float[ndarray, "*point"]:
     """1 on lines of the given width, centred on the multiples of the period."""
-    from_line = np.abs((coordinate_m / period_m + 0.5) % 1.0 - 0.5) * period_m
+    from_line = np.abs(_from_multiple(coordinate_m, period_m))
     return inside(width_m / 2 - from_line)
+
+
+def _from_multiple(
+    coordinate_m: Float[ndarray, "*point"], period_m: float, *, shift: float = 0.0
+) -> Float[ndarray, "*point"]:
+    """Signed distance to the nearest multiple of the period, less `shift` periods."""
+    return ((coordinate_m / period_m + shift + 0.5) % 1.0 - 0.5) * period_m
 
 
 def dots(
@@ -38,8 +45,8 @@ def dots(
     """1 on discs in a staggered grid with the given period along u and v."""
     distances = []
     for shift in (0.0, 0.5):
-        du = ((u_m / period_m[0] + shift + 0.5) % 1.0 - 0.5) * period_m[0]
-        dv = ((v_m / period_m[1] + shift + 0.5) % 1.0 - 0.5) * period_m[1]
+        du = _from_multiple(u_m, period_m[0], shift=shift)
+        dv = _from_multiple(v_m, period_m[1], shift=shift)
         distances.append(np.hypot(du, dv))
     return inside(radius_m - np.minimum(*distances))
 

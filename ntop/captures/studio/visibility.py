@@ -30,17 +30,12 @@ from ntop.captures.studio.raycast import RayMesh
 from ntop.captures.studio.views import Scene, hit_parts
 from ntop.conventions import NUM_JOINTS
 from ntop.geometry.cameras import Camera
-from ntop.storage.schemas import INT32, STRING, vector
+from ntop.storage.schemas import RENDER_KEY, vector
 
 # One row per true view, beside its render table.
 VISIBILITY = pa.schema(
     [
-        ("source", STRING),
-        ("actor", STRING),
-        ("action", STRING),
-        ("rig", STRING),
-        ("frame", INT32),
-        ("view", STRING),
+        *RENDER_KEY,
         ("visibility_coco17", vector(17, pa.int8())),
         ("visibility_smpl24", vector(NUM_JOINTS, pa.int8())),
     ]

@@ -6,11 +6,10 @@ without jitter). Depth, parts, alpha and crop mean what they mean for the grid.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from ntop.body.model import BodyModel
@@ -26,6 +25,7 @@ from ntop.field.humannerf.skeleton import (
     canonical_skeleton,
     posed_skeleton,
 )
+from ntop.field.marching import Seen
 from ntop.field.rendering import Rendering
 from ntop.geometry.cameras import Camera, pixel_grid
 
@@ -43,14 +43,6 @@ class PosedHumanNerf:
     samples: int
     weight_floor: float
     device: torch.device
-
-
-class _Piece(NamedTuple):
-    colours: Float[np.ndarray, "ray 3"]
-    alpha: Float[np.ndarray, " ray"]
-    depth_m: Float[np.ndarray, " ray"]
-    parts: UInt8[np.ndarray, " ray"]
-    evaluations: int
 
 
 def pose_humannerf(avatar: HumanNerfAvatar, model: BodyModel, pose: BodyPose) -> PosedHumanNerf:
@@ -97,7 +89,7 @@ def render_humannerf(posed: PosedHumanNerf, camera: Camera) -> Rendering:
         whole[chosen.numpy()] = flat
         return whole.reshape(height, width, *flat.shape[1:])
 
-    alpha = image([piece.alpha for piece in found])
+    alpha = image([piece.opacity for piece in found])
     alpha[alpha < VISIBLE] = 0
     straight = image([piece.colours for piece in found]) / np.maximum(alpha, 1e-6)[..., None]
     rgb = np.where(alpha[..., None] > 0, np.clip(straight, 0, 1), 0).astype(np.float32)
@@ -116,7 +108,7 @@ def _piece(
     origin: Float[Tensor, " 3"],
     directions: Float[Tensor, "ray 3"],
     interval: Interval,
-) -> _Piece:
+) -> Seen:
     interval = Interval(
         interval.near.float().to(posed.device),
         interval.far.float().to(posed.device),
@@ -139,7 +131,7 @@ def _piece(
     flat = known * posed.samples + index[known]
     places = found.samples.canonical[torch.searchsorted(found.samples.kept, flat)]
     parts[known.cpu().numpy()] = posed.canonical.parts_at(places.cpu().numpy())
-    return _Piece(
+    return Seen(
         found.colours.cpu().numpy(),
         found.opacity.cpu().numpy(),
         torch.where(torch.isfinite(depth), depth, 0.0).cpu().numpy(),

@@ -90,12 +90,7 @@ def joint_box(joints: Float[np.ndarray, "24 3"]) -> Box:
 
 def posed_skeleton(model: BodyModel, pose: BodyPose) -> PosedSkeleton:
     """Transforms and box of a single pose."""
-    exact = BodyPose(
-        betas=pose.betas.double(),
-        global_orient=pose.global_orient.double(),
-        body_pose=pose.body_pose.double(),
-        transl=pose.transl.double(),
-    )
+    exact = pose.double()
     body = pose_body(model, exact)
     joints, bones = body.joints.numpy(), body.posed_from_rest.numpy().copy()
     origin = joints[0].copy()

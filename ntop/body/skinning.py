@@ -25,6 +25,15 @@ class BodyPose:
     body_pose: Float[Tensor, "*batch 69"]
     transl: Float[Tensor, "*batch 3"]
 
+    def at(self, index: int) -> "BodyPose":
+        """One pose of a batch."""
+        return BodyPose(
+            betas=self.betas[index],
+            global_orient=self.global_orient[index],
+            body_pose=self.body_pose[index],
+            transl=self.transl[index],
+        )
+
     def double(self) -> "BodyPose":
         """The same in float64."""
         return BodyPose(

@@ -12,7 +12,7 @@ A stopped training continues at its last checkpoint in the work folder, with the
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import assert_never
@@ -25,10 +25,11 @@ from ntop.config.sections import TrainConfig
 from ntop.field.devices import kernel_words
 from ntop.field.humannerf.device import compute_device, device_words
 from ntop.field.humannerf.settings import HumanNerfSettings
-from ntop.field.humannerf.settings import Progress as HumanNerfProgress
 from ntop.field.humannerf.training import train_humannerf
 from ntop.field.interface import AnyAvatar, save_avatar
-from ntop.field.training import Progress, TrainingSettings, TrainingStoppedError, train
+from ntop.field.progress import Progress, TrainingStoppedError
+from ntop.field.schedule import TrainingSettings
+from ntop.field.training import train
 from ntop.field.views import TrainingViews
 from ntop.metrics.lpips import load_lpips
 from ntop.stages import VERSIONS
@@ -108,7 +109,7 @@ def train_field(
     *,
     checkpoint_path: Path,
     stop_requested: Callable[[], bool],
-) -> tuple[AnyAvatar, list[Progress] | list[HumanNerfProgress]]:
+) -> tuple[AnyAvatar, Sequence[Progress]]:
     """Train the configured kind of avatar.
 
     Raises:
@@ -179,7 +180,7 @@ class _Reporter:
         self._first: tuple[int, float] | None = None
         self._last_s = 0.0
 
-    def __call__(self, line: Progress | HumanNerfProgress) -> None:
+    def __call__(self, line: Progress) -> None:
         now_s = time.monotonic()
         if self._first is None:
             self._first = (line.step, now_s)  # the first step's time is compilation

@@ -34,7 +34,7 @@ from ntop.field.humannerf.skeleton import Box, canonical_skeleton, gaussian_bone
 from ntop.field.humannerf.trainer import HumanNerfTrainer
 from ntop.field.humannerf.training import train_humannerf
 from ntop.field.interface import load_avatar, pose_avatar, render_view, save_avatar
-from ntop.field.training import TrainingStoppedError, single_pose
+from ntop.field.progress import TrainingStoppedError
 from ntop.metrics.images import Cutout, psnr_box_db, psnr_db, tight_window
 from ntop.stages import s1_capture
 
@@ -255,7 +255,7 @@ def test_it_learns_the_actor_and_leaves_nothing_visible_out(views, model, tmp_pa
     loaded = load_avatar(tmp_path)
     view = 0  # watched: never trained on
     camera = views.cameras[views.camera_of_view[view]]
-    pose = single_pose(views.poses, int(views.pose_of_view[view]))
+    pose = views.poses.at(int(views.pose_of_view[view]))
     picture = render_view(pose_avatar(loaded, model, pose), camera)
     truth = photograph(views, view)
     box = tight_window(truth.mask).of(truth.on_grey())  # no constant does better than its mean

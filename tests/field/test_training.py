@@ -11,8 +11,10 @@ from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
 from ntop.field.avatar import ARRAYS_NAME, load_avatar, save_avatar
+from ntop.field.progress import TrainingStoppedError
 from ntop.field.rendering import RenderSettings, pose_avatar, render_view
-from ntop.field.training import TrainingSettings, TrainingStoppedError, train
+from ntop.field.schedule import TrainingSettings
+from ntop.field.training import train
 from ntop.field.views import TrainingViews
 from ntop.geometry.cameras import Camera, Pinhole
 

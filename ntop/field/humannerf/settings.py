@@ -1,4 +1,4 @@
-"""What the twin's training is told, and what it says of itself."""
+"""What the twin's training is told."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -38,13 +38,3 @@ class HumanNerfSettings:
     record_every: int = 10
     watch_every: int = 250
     architecture: Architecture = field(default_factory=Architecture)
-
-
-@dataclass(frozen=True)
-class Progress:
-    """One line of the curve. Watched PSNR is NaN where it was not measured."""
-
-    step: int
-    loss: float
-    psnr_person_db: float
-    watched_psnr_db: float

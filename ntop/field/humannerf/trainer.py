@@ -26,9 +26,9 @@ from ntop.field.humannerf.networks import (
     new_networks,
 )
 from ntop.field.humannerf.patches import Patches, PatchSource
-from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual, Progress
+from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual
 from ntop.field.humannerf.skeleton import canonical_skeleton, gaussian_bones, posed_skeleton
-from ntop.field.training import psnr_db, single_pose
+from ntop.field.progress import Progress, psnr_db
 from ntop.field.views import TrainingViews
 
 BETAS = (0.9, 0.99)
@@ -72,7 +72,7 @@ class HumanNerfTrainer:
         self._optimiser = _optimiser(self._networks, settings)
         self._views = views
         self._poses = [
-            on_device(posed_skeleton(model, single_pose(views.poses, p)), self._device)
+            on_device(posed_skeleton(model, views.poses.at(p)), self._device)
             for p in range(len(views.poses.transl))
         ]
         limits = {"side_px": settings.patch_px, "inside_share": settings.inside_share}

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from ntop.body.model import BodyModel
 from ntop.field.humannerf.avatar import HumanNerfAvatar
-from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual, Progress
+from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual
 from ntop.field.humannerf.trainer import HumanNerfTrainer
-from ntop.field.training import TrainingStoppedError
+from ntop.field.progress import Progress, TrainingStoppedError
 from ntop.field.views import TrainingViews
 
 CHECKPOINT_EVERY_S = 60.0

@@ -22,7 +22,7 @@ from ntop.storage.manifest import MANIFEST_NAME
 from ntop.storage.remedies import FILES_NAME, output_of
 from ntop.storage.renders import IMAGE_FOLDERS
 from ntop.storage.shards import ARCHIVE_NAME
-from ntop.storage.tables import Row, read_table
+from ntop.storage.tables import Row, completed, read_table
 
 EXIT_DAMAGED = 1
 FILES_PER_TASK = 512
@@ -191,7 +191,8 @@ def count_manifest(path: Path) -> tuple[Counter[str], Counter[str]]:
     """Images and persons of each split."""
     images, persons = Counter[str](), Counter[str]()
     with pq.ParquetFile(path, page_checksum_verification=True) as table:
-        if table.schema_arrow.names != schemas.MANIFEST.names:
+        found = completed(table.schema_arrow.empty_table(), schemas.MANIFEST)
+        if found.schema.names != schemas.MANIFEST.names:
             raise ValueError(f"{path.name} has other columns than a manifest")
         for batch in table.iter_batches(columns=IMAGE_COLUMNS):
             for row in batch.to_pylist():

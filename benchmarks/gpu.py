@@ -273,10 +273,7 @@ def view_rays(posed: PosedAvatar, camera: Camera) -> tuple[Scene, Rays, MarchRul
     origin = camera.center_world.double().numpy() - posed.warp.origin_world
     chosen = np.ascontiguousarray(directions[valid].double().numpy())
     rays = Rays(np.zeros(1, np.int64), origin[None], chosen, np.full(len(chosen), settings.phase))
-    rule = MarchRule(
-        settings.step_m, settings.stop_transmittance, settings.colour_floor, settings.intervals
-    )
-    return posed.scene, rays, rule
+    return posed.scene, rays, settings.rule
 
 
 PARTS: dict[str, Callable[[], dict[str, Any]]] = {

@@ -9,6 +9,7 @@ that keeps the bars. Costs are evaluations (exact, the tie-breaker) and processo
 the default, measured in turns: base, candidate, base.
 """
 
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +22,7 @@ from matplotlib import pyplot as plt
 
 from benchmarks.environment import RESULTS, write_result
 from benchmarks.subjects import RIGS, Subject, subjects
-from ntop.conventions import PIXEL_CENTRE
+from ntop.conventions import PIXEL_CENTRE, VIEWS
 from ntop.field.culling import body_pixels
 from ntop.field.rendering import (
     PRESETS,
@@ -34,8 +35,7 @@ from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import resized
 from ntop.metrics.stripes import MAX_AMPLITUDE, MAX_Z, lock_in
 
-RAYS_PER_VIEW = 1000
-VIEWS = ("centre", "e", "nw")
+RAYS_PER_VIEW = 400
 ROUNDS = 7
 MAX_RMS, MAX_P999 = 0.5, 1.0  # grey levels
 SEEN_ALPHA = 0.02
@@ -43,16 +43,23 @@ SMALL_PX = 250  # images whose spatial error is measured
 EIGHT_BIT_FLOOR = 1 / np.sqrt(12)  # rms of rounding, grey levels
 BASE = RenderSettings(edge_rays=1)
 REFERENCE = RenderSettings(
-    step_m=1e-4, stop_transmittance=0.0, colour_floor=0.0, cells=False, edge_rays=1
+    step_m=1e-4,
+    piece_depth=math.inf,
+    stop_transmittance=0.0,
+    colour_floor=0.0,
+    cells=False,
+    edge_rays=1,
 )
 KNOBS = {
     "step_m": (0.008, 0.006, 0.004, 0.003, 0.002, 0.0015, 0.001, 0.0005),
+    "piece_depth": (64.0, 4.0, 2.0, 1.0, 0.5),
     "stop_transmittance": (1e-2, 1e-3, 1e-4, 0.0),
     "colour_floor": (1e-2, 1e-3, 1e-4, 0.0),
     "extent": (0.0, 0.5, 1.0),
     "cells": (True, False),
 }
-CHOSEN_KNOBS = ("step_m", "stop_transmittance", "colour_floor")  # the others are exact or wrong
+# the others are exact or wrong
+CHOSEN_KNOBS = ("step_m", "piece_depth", "stop_transmittance", "colour_floor")
 
 
 @dataclass(frozen=True)

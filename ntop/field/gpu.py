@@ -72,7 +72,7 @@ class ReadyMarch:
             cuda.device_array((count, 3), np.float32), cuda.device_array(count, np.float32),
             cuda.device_array(count, np.float32), cuda.device_array(count, np.uint8),
         )  # fmt: skip
-        self._evaluations = _zeros(1)
+        self._evaluations = _zeros(2)
         self._arguments = (
             _SCENE.tables(scene.grid), _SCENE.tables(scene.warp),
             _SCENE.tables(scene.density), _SCENE.tables(scene.sheets),
@@ -88,8 +88,8 @@ class ReadyMarch:
 
     def fetch(self) -> Seen:
         """What was seen, after all launches."""
-        evaluations = int(self._evaluations.copy_to_host()[0])
-        return Seen(*(array.copy_to_host() for array in self._outputs), evaluations)
+        voxels, samples = (int(sum_) for sum_ in self._evaluations.copy_to_host())
+        return Seen(*(array.copy_to_host() for array in self._outputs), voxels, samples)
 
 
 def march_on_gpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:

@@ -36,19 +36,24 @@ class MarchRule(NamedTuple):
     """How a march goes, as of `render_rays`; the step is in metres."""
 
     step_m: float
+    piece_depth: float
     stop: float
     colour_floor: float
     skipping: bool
 
 
 class Seen(NamedTuple):
-    """Rays one by one: premultiplied colour, opacity, depth (m), part; evaluations of all."""
+    """Rays one by one: premultiplied colour, opacity, depth (m), part; the cost of all.
+
+    `voxels` were looked up, and `samples` densities computed in them.
+    """
 
     colours: Float[np.ndarray, "ray 3"]
     opacity: Float[np.ndarray, " ray"]
     depth_m: Float[np.ndarray, " ray"]
     parts: UInt8[np.ndarray, " ray"]
-    evaluations: int
+    voxels: int
+    samples: int
 
 
 def march_rays(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
@@ -65,10 +70,10 @@ def march_on_cpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
     count = len(rays.directions)
     colours, opacity = np.empty((count, 3), np.float32), np.empty(count, np.float32)
     depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
-    evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
+    evaluations = np.zeros((-(-count // RAYS_PER_CHUNK), 2), np.int64)
     render_rays(
         scene.grid, scene.warp, scene.density, scene.sheets, scene.light, scene.labels.values,
         scene.labels.origin, 1 / scene.labels.spacing_m, *rays, *rule, colours, opacity,
         depth, parts, evaluations,
     )  # fmt: skip
-    return Seen(colours, opacity, depth, parts, int(evaluations.sum()))
+    return Seen(colours, opacity, depth, parts, *(int(sum_) for sum_ in evaluations.sum(0)))

@@ -43,6 +43,8 @@ class RenderSettings:
 
     Args:
         step_m: Largest length of a piece of a ray; faces of voxels cut it as well.
+        piece_depth: Largest optical depth of a piece, by its denser end (infinity: any); the less
+            light is left on the ray, the deeper it may be.
         stop_transmittance: Light left at which a ray ends (0: never); bounds the colour's error.
         colour_floor: Light up to which pieces of a ray share one colour (0: each has its own).
         intervals: Jump over space that no warp cell covers.
@@ -53,7 +55,8 @@ class RenderSettings:
         phase: Offset of all pieces, in steps, for the phase-shift self-test.
     """
 
-    step_m: float = 0.002
+    step_m: float = 0.004
+    piece_depth: float = 1.0
     stop_transmittance: float = 1e-3
     colour_floor: float = 1e-4
     intervals: bool = True
@@ -67,21 +70,38 @@ class RenderSettings:
         """Refuse steps that never reach the end of a ray, and lights that cannot be left.
 
         Raises:
-            ConfigError: `step_m` or `stop_transmittance` is out of range.
+            ConfigError: `step_m`, `piece_depth` or `stop_transmittance` is out of range.
         """
         if not 0 < self.step_m < math.inf:
             raise ConfigError(f"render step_m is {self.step_m} m, expected a positive length")
+        if not self.piece_depth > 0:
+            raise ConfigError(f"render piece_depth is {self.piece_depth}, expected more than 0")
         if not 0 <= self.stop_transmittance < 1:
             raise ConfigError(
                 f"render stop_transmittance is {self.stop_transmittance}, expected 0 <= it < 1"
             )
 
+    @property
+    def rule(self) -> MarchRule:
+        """What of this a march asks for."""
+        return MarchRule(
+            step_m=self.step_m,
+            piece_depth=self.piece_depth,
+            stop=self.stop_transmittance,
+            colour_floor=self.colour_floor,
+            skipping=self.intervals,
+        )
+
 
 # chosen and measured by `make bench`: benchmarks/quadrature.py, docs/benchmarks.md
 PRESETS = {
-    "draft": RenderSettings(step_m=0.008, stop_transmittance=1e-2, colour_floor=2e-2, edge_rays=1),
+    "draft": RenderSettings(
+        step_m=0.008, piece_depth=4.0, stop_transmittance=1e-2, colour_floor=2e-2, edge_rays=1
+    ),
     "default": RenderSettings(),
-    "reference": RenderSettings(step_m=0.0005, stop_transmittance=1e-5, colour_floor=0.0),
+    "reference": RenderSettings(
+        step_m=0.0005, piece_depth=0.5, stop_transmittance=1e-5, colour_floor=0.0
+    ),
 }
 
 
@@ -91,8 +111,8 @@ class Rendering:
 
     `depth_m` is the ray length at which half of the light is gone, `parts` holds label + 1; both
     are 0 outside the mask (alpha below one half). `window` (left, top, width, height) holds every
-    pixel with alpha > 0; all is zero outside. `evaluations` counts voxels looked
-    up and densities computed.
+    pixel with alpha > 0; all is zero outside. `voxels` were looked up, `samples` densities computed
+    in them.
     """
 
     rgb: Float[np.ndarray, "height width 3"]
@@ -100,7 +120,13 @@ class Rendering:
     depth_m: Float[np.ndarray, "height width"]
     parts: UInt8[np.ndarray, "height width"]
     window: tuple[int, int, int, int]
-    evaluations: int
+    voxels: int
+    samples: int
+
+    @property
+    def evaluations(self) -> int:
+        """What it cost: voxels looked up and densities computed."""
+        return self.voxels + self.samples
 
 
 @dataclass(frozen=True)
@@ -111,7 +137,13 @@ class RayRendering:
     alpha: Float[np.ndarray, " ray"]
     depth_m: Float[np.ndarray, " ray"]
     parts: UInt8[np.ndarray, " ray"]
-    evaluations: int
+    voxels: int
+    samples: int
+
+    @property
+    def evaluations(self) -> int:
+        """What it cost: voxels looked up and densities computed."""
+        return self.voxels + self.samples
 
 
 @dataclass(frozen=True)
@@ -203,10 +235,7 @@ def trace_rays(
     origin = center_world.double().numpy() - posed.warp.origin_world
     directions = unit_directions(origin, directions_world.double().numpy())
     rays = Rays(np.zeros(1, np.int64), origin[None], directions, np.full(count, settings.phase))
-    rule = MarchRule(
-        settings.step_m, settings.stop_transmittance, settings.colour_floor, settings.intervals
-    )
-    seen = march_rays(posed.scene, rays, rule)
+    seen = march_rays(posed.scene, rays, settings.rule)
     if not (np.isfinite(seen.colours).all() and np.isfinite(seen.opacity).all()):
         raise DataError(
             "rendered pixels are not finite: the avatar holds NaN or infinity; train it again"
@@ -246,7 +275,7 @@ def render_view(
     window = pixel_window(mask)
     left, top, columns, rows = window
     if columns == 0:
-        return Rendering(rgb, alpha, depth, parts, window, 0)
+        return Rendering(rgb, alpha, depth, parts, window, 0, 0)
     inner = (slice(top, top + rows), slice(left, left + columns))
     v, u = np.nonzero(mask[inner])
     centres = np.stack([u + left, v + top], 1) + PIXEL_CENTRE
@@ -255,7 +284,7 @@ def render_view(
     box_alpha = np.zeros((rows, columns), np.float32)
     premultiplied[v, u], box_alpha[v, u] = first.rgb, first.alpha
     depth[v + top, u + left], parts[v + top, u + left] = first.depth_m, first.parts
-    evaluations = first.evaluations
+    voxels, samples = first.voxels, first.samples
     if settings.edge_rays > 1:
         edges = edge_pixels(premultiplied, box_alpha)[v, u]
         shifted = centres[edges][:, None] + np.array(EDGE_OFFSETS_PX)
@@ -265,12 +294,12 @@ def render_view(
         chosen = np.arange(len(shifted)) * 4 + middle_ray(more.alpha, more.depth_m)
         depth[v[edges] + top, u[edges] + left] = more.depth_m[chosen]
         parts[v[edges] + top, u[edges] + left] = more.parts[chosen]
-        evaluations += more.evaluations
+        voxels, samples = voxels + more.voxels, samples + more.samples
     rgb[inner] = straight_colours(premultiplied, box_alpha)
     alpha[inner] = box_alpha
     empty = np.rint(255 * alpha) < MASK_ALPHA
     depth[empty], parts[empty] = 0, 0
-    return Rendering(rgb, alpha, depth, parts, window, evaluations)
+    return Rendering(rgb, alpha, depth, parts, window, voxels, samples)
 
 
 def _trace_pixels(
@@ -290,4 +319,4 @@ def _trace_pixels(
         everywhere = np.zeros((len(pixels), *values.shape[1:]), values.dtype)
         everywhere[kept] = values
         spread.append(everywhere)
-    return RayRendering(*spread, found.evaluations)
+    return RayRendering(*spread, found.voxels, found.samples)

@@ -1,5 +1,7 @@
 """Rays of the views set aside: how well the grid shows what it does not train on."""
 
+import math
+
 import numpy as np
 
 from ntop.field.canonical import PartLabels
@@ -46,7 +48,11 @@ def watched_psnr(
     offsets = np.full(len(batch.poses), 0.5)
     rays = Rays(batch.poses, batch.origins, batch.directions, offsets)
     rule = MarchRule(
-        march_step_m(state.grid.voxel_m, settings), STOP_TRANSMITTANCE, 0.0, skipping=True
+        step_m=march_step_m(state.grid.voxel_m, settings),
+        piece_depth=math.inf,
+        stop=STOP_TRANSMITTANCE,
+        colour_floor=0.0,
+        skipping=True,
     )
     seen = march_on_cpu(scene, rays, rule)  # the state's arrays may change where they are
     gain = state.gain[batch.cameras]

@@ -29,11 +29,12 @@ def rendered(grid, warp, origins, directions, *, offsets, light, stop=0.0, step_
     count = len(directions)
     colours, opacity = np.empty((count, 3), np.float32), np.empty(count, np.float32)
     depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
-    evaluations = np.zeros(-(-count // RAYS_PER_CHUNK), np.int64)
+    evaluations = np.zeros((-(-count // RAYS_PER_CHUNK), 2), np.int64)
     render_rays(
         grid.tables(), warp.tables, packed_density(grid), packed_sheets(grid.tables(), warp.tables),
         light, np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0, np.zeros(1, np.int64), origins,
-        directions, offsets, step_m, stop, 0.0, True, colours, opacity, depth, parts, evaluations,
+        directions, offsets, step_m, np.inf, stop, 0.0, True, colours, opacity, depth, parts,
+        evaluations,
     )  # fmt: skip
     return colours, opacity, depth, evaluations
 

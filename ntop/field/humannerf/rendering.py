@@ -27,6 +27,7 @@ from ntop.field.humannerf.skeleton import (
 )
 from ntop.field.marching import Seen
 from ntop.field.rendering import Rendering
+from ntop.field.straight import straight_colours
 from ntop.geometry.cameras import Camera, pixel_grid
 
 RAYS_PER_PIECE = {"cpu": 1024, "cuda": 16384}  # of 128 samples, of which a fifth are evaluated
@@ -69,7 +70,7 @@ def render_humannerf(posed: PosedHumanNerf, camera: Camera) -> Rendering:
         empty = np.zeros((height, width), np.float32)
         return Rendering(
             np.zeros((height, width, 3), np.float32), empty, empty.copy(),
-            np.zeros((height, width), np.uint8), (0, 0, 0, 0), 0,
+            np.zeros((height, width), np.uint8), (0, 0, 0, 0), 0, 0,
         )  # fmt: skip
     near = Interval(*(values[chosen] for values in interval))
     pieces = torch.arange(len(chosen)).split(RAYS_PER_PIECE[posed.device.type])
@@ -91,15 +92,14 @@ def render_humannerf(posed: PosedHumanNerf, camera: Camera) -> Rendering:
 
     alpha = image([piece.opacity for piece in found])
     alpha[alpha < VISIBLE] = 0
-    straight = image([piece.colours for piece in found]) / np.maximum(alpha, 1e-6)[..., None]
-    rgb = np.where(alpha[..., None] > 0, np.clip(straight, 0, 1), 0).astype(np.float32)
+    rgb = straight_colours(image([piece.colours for piece in found]), alpha)
     depth, parts = image([p.depth_m for p in found]), image([p.parts for p in found])
     outside = np.rint(255 * alpha) < MASK_ALPHA
     depth[outside], parts[outside] = 0, 0
     columns, rows = chosen.numpy() % width, chosen.numpy() // width
     left, top = int(columns.min()), int(rows.min())
     window = (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
-    return Rendering(rgb, alpha, depth, parts, window, sum(p.evaluations for p in found))
+    return Rendering(rgb, alpha, depth, parts, window, 0, sum(p.samples for p in found))
 
 
 @torch.no_grad()  # here and not above: the mode belongs to a thread
@@ -136,5 +136,6 @@ def _piece(
         found.opacity.cpu().numpy(),
         torch.where(torch.isfinite(depth), depth, 0.0).cpu().numpy(),
         parts,
+        0,
         len(found.samples.kept),
     )

@@ -44,21 +44,22 @@ LARGEST = 2.0**20  # of what is added; a ray's slopes are of the order of 1
 @cuda.jit(cache=True)
 def march_rays(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
-    directions, offsets, step, stop, colour_floor, skipping, colours, opacity, depth, parts,
-    evaluations,
+    directions, offsets, step, piece_depth, stop, colour_floor, skipping, colours, opacity, depth,
+    parts, evaluations,
 ):  # fmt: skip
-    """As `march.render_rays`, but `evaluations` (1,) int64 is their sum."""
+    """As `march.render_rays`, but `evaluations` (2,) int64 are sums over all rays."""
     r = cuda.grid(1)
     if r >= directions.shape[0]:
         return
-    red, green, blue, opaque, median, part, number = march_ray(
+    red, green, blue, opaque, median, part, voxels, samples = march_ray(
         grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
         poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
-        directions[r], offsets[r], step, stop, colour_floor, skipping,
+        directions[r], offsets[r], step, piece_depth, stop, colour_floor, skipping,
     )  # fmt: skip
     colours[r, 0], colours[r, 1], colours[r, 2] = red, green, blue
     opacity[r], depth[r], parts[r] = opaque, median, part
-    cuda.atomic.add(evaluations, 0, number)
+    cuda.atomic.add(evaluations, 0, voxels)
+    cuda.atomic.add(evaluations, 1, samples)
 
 
 @cuda.jit(device=True)

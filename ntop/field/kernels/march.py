@@ -96,6 +96,48 @@ def to_next_voxel(path, s):
 
 
 @device
+def raw_on_path(corners, place, path):
+    """Raw density on a straight path through a voxel, as a cubic of the metres gone in it.
+
+    Args:
+        corners: (8,) raw density of its nodes. place: (3,) where the path enters, in voxels from
+            the first node. path: see `path_between`.
+
+    Returns:
+        The four coefficients, from the constant one up.
+    """
+    c0, c1, c2, c3, c4, c5, c6, c7 = corners
+    # of 1, z, y, yz, x, xz, xy, xyz
+    c7 = c7 - c6 - c5 + c4 - c3 + c2 + c1 - c0
+    c6 = c6 - c4 - c2 + c0
+    c5 = c5 - c4 - c1 + c0
+    c3 = c3 - c2 - c1 + c0
+    c4, c2, c1 = c4 - c0, c2 - c0, c1 - c0
+    x, y, z = place
+    dx, dy, dz = path[3], path[4], path[5]
+    return (
+        c0 + x * (c4 + y * (c6 + z * c7) + z * c5) + y * (c2 + z * c3) + z * c1,
+        dx * (c4 + y * (c6 + z * c7) + z * c5)
+        + dy * (c2 + x * (c6 + z * c7) + z * c3)
+        + dz * (c1 + x * (c5 + y * c7) + y * c3),
+        dx * dy * (c6 + z * c7) + dx * dz * (c5 + y * c7) + dy * dz * (c3 + x * c7),
+        c7 * dx * dy * dz,
+    )
+
+
+@device
+def stays_empty(raw_0, raw_1, raw_2, raw_3, length):
+    """Is a cubic nowhere above EMPTY_RAW on [0, length]? Its Bernstein coefficients bound it."""
+    first, second, third = raw_1 * length, raw_2 * length * length, raw_3 * length**3
+    return (
+        raw_0 <= EMPTY_RAW
+        and raw_0 + first / 3 <= EMPTY_RAW
+        and raw_0 + (2 * first + second) / 3 <= EMPTY_RAW
+        and raw_0 + first + second + third <= EMPTY_RAW
+    )
+
+
+@device
 def mean_place(tau, lost):
     """Where a homogeneous piece of optical depth tau takes its light on average, as a share.
 
@@ -146,19 +188,19 @@ def part_at(grid, labels, labels_origin, inverse_spacing, x, y, z):
 @device
 def march_ray(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, pose, origin,
-    direction, offset, step, stop, colour_floor, skipping,
+    direction, offset, step, piece_depth, stop, colour_floor, skipping,
 ):  # fmt: skip
     """One ray; arguments as of `render_rays`.
 
-    Returns red, green, blue (premultiplied), opacity, depth, part and the number of evaluations:
-    voxels looked up, and densities computed in them.
+    Returns red, green, blue (premultiplied), opacity, depth, part, and the numbers of voxels looked
+    up and of samples, densities computed in them.
     """
     ray, t, far = start_ray(warp, pose, origin, direction)
     red = green = blue = 0.0
     coloured = carried = 0.0
     thickness, transmittance = 0.0, 1.0
     depth, part = 0.0, 0
-    looked_up = 0
+    voxels = samples = 0
     last_cell, last_t = -1, -1.0
     end_a = end_b = (0.0, 0.0, 0.0)
     while transmittance >= stop:
@@ -166,7 +208,7 @@ def march_ray(
         if cell == -1:
             break
         if cell == -2:
-            looked_up += 1
+            voxels += 1
             t = leave
             continue
         length = leave - t
@@ -196,37 +238,46 @@ def march_ray(
             x, y, z = along(path_a, 0.5 * (s + border))
             i, j, k = voxel_of(grid, x, y, z)
             slot = brick_of(density, i, j, k)
-            looked_up += 1
+            voxels += 1
             if slot == 0 and not two:
                 s = border
                 continue
             c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(density, slot, i, j, k)
-            empty = c0 <= EMPTY_RAW and c1 <= EMPTY_RAW and c2 <= EMPTY_RAW and c3 <= EMPTY_RAW
-            empty = empty and c4 <= EMPTY_RAW and c5 <= EMPTY_RAW
-            if empty and c6 <= EMPTY_RAW and c7 <= EMPTY_RAW and not two:
+            x, y, z = along(path_a, s)
+            raw_0, raw_1, raw_2, raw_3 = raw_on_path(
+                (c0, c1, c2, c3, c4, c5, c6, c7), (x - i, y - j, z - k), path_a
+            )
+            if not two and stays_empty(raw_0, raw_1, raw_2, raw_3, border - s):
                 s = border
                 continue
-            # raw density as a polynomial of the place in the voxel
-            c7 = c7 - c6 - c5 + c4 - c3 + c2 + c1 - c0
-            c6 = c6 - c4 - c2 + c0
-            c5 = c5 - c4 - c1 + c0
-            c3 = c3 - c2 - c1 + c0
-            c4, c2, c1 = c4 - c0, c2 - c0, c1 - c0
+            entry = s
             while s < border and transmittance >= stop:
                 # to the next node of the lattice
                 node = (math.floor((t + s) / step - offset + ON_FACE) + 1 + offset) * step - t
                 end = max(min(node, border), s + TINY_M)
+                u = s - entry
+                piece_0 = raw_0 + u * (raw_1 + u * (raw_2 + u * raw_3))
+                piece_1 = raw_1 + u * (2 * raw_2 + u * 3 * raw_3)
+                piece_2 = raw_2 + 3 * u * raw_3
+                if not two and stays_empty(piece_0, piece_1, piece_2, raw_3, end - s):
+                    s = end
+                    continue
+                # and not through more than so much light, by the denser end
+                u = end - s
+                highest = max(piece_0, piece_0 + u * (piece_1 + u * (piece_2 + u * raw_3)))
+                light_ahead = transmittance * DENSITY_SCALE * max(highest, 0.0) * u
+                if light_ahead > piece_depth:
+                    end = s + max(u / math.ceil(light_ahead / piece_depth), TINY_M)
                 half = 0.5 * (end - s)
                 mass = slope = 0.0
                 for side in (-1, 1):
                     q = s + half * (1 + GAUSS_POINT * side)
-                    x, y, z = along(path_a, q)
-                    x, y, z = x - i, y - j, z - k
-                    raw = c0 + x * (c4 + y * (c6 + z * c7) + z * c5) + y * (c2 + z * c3) + z * c1
+                    u = q - s
+                    raw = piece_0 + u * (piece_1 + u * (piece_2 + u * raw_3))
                     if two:
                         x, y, z = along(path_b, q)
                         raw = max(raw, raw_density(grid, density, x, y, z))
-                    looked_up += 1
+                    samples += 1
                     if not raw <= EMPTY_RAW:  # NaN must stay visible
                         found = rendered_density(raw)
                         mass += found
@@ -273,14 +324,14 @@ def march_ray(
     if coloured > 0:  # what is still carried takes the colour of what came before
         share = 1 + carried / coloured
         red, green, blue = red * share, green * share, blue * share
-    return red, green, blue, -math.expm1(-thickness), depth, part, looked_up
+    return red, green, blue, -math.expm1(-thickness), depth, part, voxels, samples
 
 
 @kernel
 def render_rays(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
-    directions, offsets, step, stop, colour_floor, skipping, colours, opacity, depth, parts,
-    evaluations,
+    directions, offsets, step, piece_depth, stop, colour_floor, skipping, colours, opacity, depth,
+    parts, evaluations,
 ):  # fmt: skip
     """Colour, opacity, median depth and part of each ray.
 
@@ -291,23 +342,26 @@ def render_rays(
         poses: (1 or rays,) which pose of `warp`.
         origins: (1 or rays, 3) relative to the warp grid's origin. directions: (rays, 3) unit.
         offsets: (rays,) of the lattice that bounds pieces, in steps. step: of it, metres.
+        piece_depth: optical depth that a piece may have by its denser end, while all the light is
+            there; the less light is left, the deeper.
         stop: transmittance below which a ray ends.
         colour_floor: light up to which pieces share the colour of the next one that is looked up.
         skipping: whether rays jump over octants that are not occupied.
         colours, opacity, depth, parts: Outputs; colours are premultiplied, depth is metres along
             the ray where half of the light is gone, 0 where less is lost.
-        evaluations: (chunks,) voxels looked up and densities computed, for the cost reports.
+        evaluations: (chunks, 2) voxels looked up and samples, for the cost reports.
     """
     count = directions.shape[0]
     for chunk in numba.prange((count + RAYS_PER_CHUNK - 1) // RAYS_PER_CHUNK):
-        looked_up = 0
+        voxels = samples = 0
         for r in range(chunk * RAYS_PER_CHUNK, min(count, (chunk + 1) * RAYS_PER_CHUNK)):
-            red, green, blue, opaque, median, part, number = march_ray(
+            red, green, blue, opaque, median, part, looked_up, sampled = march_ray(
                 grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
                 poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
-                directions[r], offsets[r], step, stop, colour_floor, skipping,
+                directions[r], offsets[r], step, piece_depth, stop, colour_floor, skipping,
             )  # fmt: skip
             colours[r, 0], colours[r, 1], colours[r, 2] = red, green, blue
             opacity[r], depth[r], parts[r] = opaque, median, part
-            looked_up += number
-        evaluations[chunk] = looked_up
+            voxels += looked_up
+            samples += sampled
+        evaluations[chunk, 0], evaluations[chunk, 1] = voxels, samples

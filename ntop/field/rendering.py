@@ -56,9 +56,9 @@ class RenderSettings:
     """
 
     step_m: float = 0.004
-    piece_depth: float = 1.0
+    piece_depth: float = 0.5
     stop_transmittance: float = 1e-3
-    colour_floor: float = 1e-4
+    colour_floor: float = 1e-3
     intervals: bool = True
     cells: bool = True
     extent: float = 1.0
@@ -100,7 +100,7 @@ PRESETS = {
     ),
     "default": RenderSettings(),
     "reference": RenderSettings(
-        step_m=0.0005, piece_depth=0.5, stop_transmittance=1e-5, colour_floor=0.0
+        step_m=0.0005, piece_depth=0.25, stop_transmittance=1e-5, colour_floor=0.0
     ),
 }
 

@@ -17,11 +17,11 @@ from ntop.conventions import DataError
 from ntop.field.canonical import CanonicalBody, Occupancy
 from ntop.field.kernels.occupancy import octant_occupancy
 from ntop.field.kernels.posing import (
-    cell_sheets,
     nearest_vertices,
     node_records,
     vertex_maps,
 )
+from ntop.field.kernels.sheets import cell_sheets
 from ntop.field.kernels.tables import WarpTables
 
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both

@@ -134,41 +134,6 @@ def interpolate(grid, channel, rows, weights):
 
 
 @device
-def voxel_of(grid, x, y, z):
-    """Index (3) of a canonical place in voxels; -1 first where it is outside the grid."""
-    if not (x >= 0 and y >= 0 and z >= 0):  # also refuses NaN
-        return -1, 0, 0
-    i, j, k = int(x), int(y), int(z)
-    shape = grid.bricks.shape
-    if i + 1 >= 4 * shape[0] or j + 1 >= 4 * shape[1] or k + 1 >= 4 * shape[2]:
-        return -1, 0, 0
-    return i, j, k
-
-
-@device
-def row_of(grid, i, j, k):
-    """Row of a node's values."""
-    return grid.bricks[i >> 2, j >> 2, k >> 2] * 64 + (((i & 3) << 4) | ((j & 3) << 2) | (k & 3))
-
-
-@device
-def raw_colour(grid, x, y, z):
-    """Raw red, green and blue at a canonical place in voxels."""
-    i, j, k = voxel_of(grid, x, y, z)
-    if i < 0:
-        return 0.0, 0.0, 0.0
-    fx, fy, fz = x - i, y - j, z - k
-    red = green = blue = 0.0
-    for c in range(8):
-        row = row_of(grid, i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1))
-        w = (fx if c & 4 else 1 - fx) * (fy if c & 2 else 1 - fy) * (fz if c & 1 else 1 - fz)
-        red += w * grid.values[row, 1]
-        green += w * grid.values[row, 2]
-        blue += w * grid.values[row, 3]
-    return red, green, blue
-
-
-@device
 def shade(light, channel, x, y, z):
     """Light on a surface with unit normal (x, y, z): a quadratic, as second-order harmonics are.
 

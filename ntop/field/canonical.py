@@ -153,8 +153,9 @@ def distance_grid(
         np.zeros((1, 3, 4)),
         dims,
         spacing_m,
-        np.array([reach_m + spacing_m, 0.0]),
+        reach_m + spacing_m,
         1.0,
+        1,
         nearest,
         squared,
     )

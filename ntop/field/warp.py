@@ -27,7 +27,6 @@ from ntop.field.kernels.tables import WarpTables
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
-FACE_M = 0.032  # how far a point of the body's surface may be from every vertex
 MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
 MAX_AWAY = 8  # blocks; how far a ray may jump over empty space at once
 STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
@@ -70,8 +69,8 @@ def pose_warp(
     nearest = np.empty((2, count), np.int32)
     distance = np.empty((2, count), np.float32)
     nearest_vertices(
-        vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m,
-        np.array([radius, min(radius, math.hypot(reach_m, FACE_M))]), APART_M, nearest, distance,
+        vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m, radius, APART_M,
+        2, nearest, distance,
     )  # fmt: skip
     candidates, nodes = np.nonzero(nearest >= 0)
     records = np.empty((len(nodes), 6), np.float32)

@@ -115,12 +115,10 @@ def test_nearest_vertices_equal_brute_force():
     generator = np.random.default_rng(3)
     posed = generator.uniform(0.05, 0.35, (200, 3)).astype(np.float32)
     maps = generator.uniform(-0.5, 0.5, (200, 3, 4)).astype(np.float32)
-    dims, cell, apart = np.array([21, 22, 23]), 0.02, 0.15
-    radius, second = 0.06, 0.05
+    dims, cell, radius, apart = np.array([21, 22, 23]), 0.02, 0.06, 0.15
     nearest = np.empty((2, dims.prod()), np.int32)
     distance = np.empty((2, dims.prod()), np.float32)
-    radii = np.array([radius, second])
-    nearest_vertices(posed, maps, dims, cell, radii, apart, nearest, distance)
+    nearest_vertices(posed, maps, dims, cell, radius, apart, 2, nearest, distance)
     nodes = np.stack(np.unravel_index(np.arange(dims.prod()), dims), 1) * cell
     squared = ((nodes[:, None] - posed) ** 2).sum(-1)
     first = np.where(squared.min(1) < radius**2, squared.argmin(1), -1)
@@ -129,8 +127,8 @@ def test_nearest_vertices_equal_brute_force():
     own = places[np.arange(len(nodes)), first]
     far = ((own[:, None] - places) ** 2).sum(-1) >= apart**2
     other = np.where(far & (first >= 0)[:, None], squared, np.inf)
-    expected = np.where(other.min(1) < second**2, other.argmin(1), -1)
-    np.testing.assert_array_equal(nearest[1], expected)
+    second = np.where(other.min(1) < radius**2, other.argmin(1), -1)
+    np.testing.assert_array_equal(nearest[1], second)
 
 
 def test_joined_tables_hold_each_pose_unchanged(model, body):

@@ -78,28 +78,27 @@ def squared_gap(one, other, x, y, z):
 
 
 @kernel
-def nearest_vertices(posed, maps, dims, cell, radii, apart, nearest, distance):
+def nearest_vertices(posed, maps, dims, cell, radius, apart, candidates, nearest, distance):
     """For each node the nearest posed vertex, and the nearest that leads elsewhere.
 
     Args:
         posed: (V, 3) metres relative to node (0, 0, 0).
         maps: (V, 3, 4) posed -> canonical, read for the second candidate only.
-        dims: (3,) nodes. cell: node spacing (m).
-        radii: (2,) search radii (m) of the two; the second is left empty if its radius is 0.
+        dims: (3,) nodes. cell: node spacing (m). radius: search radius (m).
         apart: distance (m) of the two canonical places of a node from which a vertex leads
             elsewhere. Both sides of a wrist lead to the same place, an arm and a trunk do not.
+        candidates: 1 or 2; with 1 the second is left empty.
         nearest: (2, nodes) int32 output, -1 where none. distance: (2, nodes) squared metres.
     """
     ny, nz = dims[1], dims[2]
+    limit = radius * radius
     inverse = 1 / cell
     for slab in numba.prange((dims[0] + SLAB - 1) // SLAB):
         first, last = slab * SLAB, min(dims[0], (slab + 1) * SLAB) - 1
         for n in range(first * ny * nz, (last + 1) * ny * nz):
             nearest[0, n] = nearest[1, n] = -1
-            distance[0, n], distance[1, n] = radii[0] * radii[0], radii[1] * radii[1]
-        for candidate in range(2 if radii[1] > 0 else 1):
-            radius = radii[candidate]
-            limit = radius * radius
+            distance[0, n] = distance[1, n] = limit
+        for candidate in range(candidates):
             for v in range(posed.shape[0]):
                 x, y, z = posed[v, 0], posed[v, 1], posed[v, 2]
                 i0 = max(first, int(math.ceil((x - radius) * inverse)))
@@ -116,11 +115,7 @@ def nearest_vertices(posed, maps, dims, cell, radii, apart, nearest, distance):
                         dxy = dx + (j * cell - y) ** 2
                         if dxy >= limit:
                             continue
-                        along = math.sqrt(limit - dxy)  # half of what is left of the sphere
-                        for k in range(
-                            max(k0, int(math.ceil((z - along) * inverse))),
-                            min(k1, int(math.floor((z + along) * inverse))) + 1,
-                        ):
+                        for k in range(k0, k1 + 1):
                             d = dxy + (k * cell - z) ** 2
                             n = (i * ny + j) * nz + k
                             if d < distance[candidate, n]:

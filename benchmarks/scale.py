@@ -3,7 +3,7 @@
 Every phase of a campaign's life is run as a user would and measured from outside; a phase that was
 measured already is not repeated, so an interrupted benchmark goes on where it was.
 
-Usage: python -m benchmarks.scale run FOLDER SIZE {files,tar} [--clone EXECUTED]
+Usage: python -m benchmarks.scale run FOLDER SIZE {files,tar} [--clone EXECUTED] [--work PLACE]
        python -m benchmarks.scale record FOLDER
 """
 
@@ -81,8 +81,10 @@ class Run:
         )
 
 
-def run(folder: Path, size: str, storage: str, *, executed: Path | None) -> None:
-    """Measure the life of one campaign."""
+def run(
+    folder: Path, size: str, storage: str, *, executed: Path | None, work: Path | None
+) -> None:
+    """Measure the life of one campaign, with its unfinished shards at `work` if that is given."""
     place = folder / f"{size}_{storage}"
     actors, actions, frames = SIZES[size]
     if (place / "config/config.yaml").exists():
@@ -91,6 +93,10 @@ def run(folder: Path, size: str, storage: str, *, executed: Path | None) -> None
         campaign = Campaign.make(
             place, actors=actors, actions=actions, frames=frames, storage=storage
         )
+    if work is not None and not (place / "results").exists():
+        work.mkdir(parents=True)
+        (place / "results").mkdir()
+        (place / "results/work").symlink_to(work)
     life = Run(campaign)
     life.phases["images"] = campaign.images
     life.phases["executed"] = executed is None
@@ -185,12 +191,14 @@ def main() -> None:
     one.add_argument("size", choices=SIZES)
     one.add_argument("storage", choices=("files", "tar"))
     one.add_argument("--clone", type=Path, metavar="EXECUTED")
+    one.add_argument("--work", type=Path, metavar="PLACE", help="a folder in memory, say")
     all_ = verbs.add_parser("record")
     all_.add_argument("folder", type=Path)
     given = parser.parse_args()
     if given.verb == "run":
         executed = given.clone.resolve() if given.clone else None
-        run(given.folder.resolve(), given.size, given.storage, executed=executed)
+        work = given.work.resolve() if given.work else None
+        run(given.folder.resolve(), given.size, given.storage, executed=executed, work=work)
     else:
         from benchmarks.scale_report import record
 

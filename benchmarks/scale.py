@@ -81,9 +81,7 @@ class Run:
         )
 
 
-def run(
-    folder: Path, size: str, storage: str, *, executed: Path | None, work: Path | None
-) -> None:
+def run(folder: Path, size: str, storage: str, *, executed: Path | None, work: Path | None) -> None:
     """Measure the life of one campaign, with its unfinished shards at `work` if that is given."""
     place = folder / f"{size}_{storage}"
     actors, actions, frames = SIZES[size]

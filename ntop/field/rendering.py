@@ -70,16 +70,19 @@ class RenderSettings:
         """Refuse steps that never reach the end of a ray, and lights that cannot be left.
 
         Raises:
-            ConfigError: `step_m`, `piece_depth` or `stop_transmittance` is out of range.
+            ConfigError: a number is out of its range.
         """
         if not 0 < self.step_m < math.inf:
             raise ConfigError(f"render step_m is {self.step_m} m, expected a positive length")
         if not self.piece_depth > 0:
             raise ConfigError(f"render piece_depth is {self.piece_depth}, expected more than 0")
-        if not 0 <= self.stop_transmittance < 1:
-            raise ConfigError(
-                f"render stop_transmittance is {self.stop_transmittance}, expected 0 <= it < 1"
-            )
+        for name in ("stop_transmittance", "colour_floor", "phase"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"render {name} is {getattr(self, name)}, expected 0 <= it < 1")
+        if not 0 <= self.extent <= 1:
+            raise ConfigError(f"render extent is {self.extent}, expected 0 <= it <= 1")
+        if self.edge_rays not in (1, 4):
+            raise ConfigError(f"render edge_rays is {self.edge_rays}, expected 1 or 4")
 
     @property
     def rule(self) -> MarchRule:

@@ -1,6 +1,7 @@
 """The fisheye lenses of virtual cameras, by the names that configurations and tables use."""
 
 from ntop.conventions import DataError
+from ntop.geometry.guards import require_lens
 from ntop.geometry.ideal_fisheyes import Equidistant, Equisolid, Stereographic
 from ntop.geometry.kannala_brandt import KannalaBrandt
 
@@ -24,6 +25,7 @@ def fisheye_lens(
     Raises:
         DataError: no such model, or parameters that it cannot have.
     """
+    require_lens(model, focal=(fx, fy), center=(cx, cy), size=(width, height))
     place = {"cx": cx, "cy": cy, "width": width, "height": height, "max_theta": max_theta}
     if model == KannalaBrandt.model:
         return KannalaBrandt(fx, fy, distortion=tuple(distortion) or (0.0,) * 4, **place)

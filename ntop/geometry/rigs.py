@@ -46,7 +46,7 @@ class Rig:
         return fisheye_lens(
             self.model,
             fx=self.focal_px,
-            fy=self.focal_y_px or self.focal_px,
+            fy=self.focal_px if self.focal_y_px is None else self.focal_y_px,
             cx=center[0],
             cy=center[1],
             width=self.width,

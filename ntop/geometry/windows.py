@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ntop.geometry.cameras import Camera, Lens
+from ntop.geometry.guards import require_lens
 from ntop.geometry.kannala_brandt import KannalaBrandt
 from ntop.geometry.pinhole import Pinhole
 
@@ -22,7 +23,14 @@ def cropped(lens: Lens, *, left: int, top: int, width: int, height: int) -> Lens
 
 
 def resized(lens: Lens, *, width: int, height: int) -> Lens:
-    """The lens of the image resized to a new size: (u, v) -> (u width / W, v height / H)."""
+    """The lens of the image resized to a new size: (u, v) -> (u width / W, v height / H).
+
+    Raises:
+        DataError: the new image has no pixels.
+    """
+    require_lens(
+        lens.model, focal=(lens.fx, lens.fy), center=(lens.cx, lens.cy), size=(width, height)
+    )
     across, down = width / lens.width, height / lens.height
     return _with_intrinsics(
         lens,

@@ -9,10 +9,13 @@ from hypothesis import strategies as st
 
 from ntop.conventions import DataError
 from ntop.geometry.cameras import Camera
+from ntop.geometry.fisheyes import fisheye_lens
 from ntop.geometry.ideal_fisheyes import Equidistant, Equisolid, Stereographic
 from ntop.geometry.kannala_brandt import KannalaBrandt
 from ntop.geometry.monotone import monotone_limit
 from ntop.geometry.pinhole import Pinhole
+from ntop.geometry.rigs import Rig
+from ntop.geometry.windows import cropped, resized
 from tests.numerics.lenses import PRECISIONS
 
 numbers = st.floats(allow_nan=True, allow_infinity=True, width=32)
@@ -92,5 +95,27 @@ def test_42_cameras_bad_parameters_are_refused(bad):
     if "max_theta" not in bad:
         with pytest.raises(DataError, match="expected"):
             Pinhole(fx=fx, fy=100.0 * bad.get("aspect", 1.0), **rest)
+    if "aspect" not in bad:  # by name, as tables and rigs ask for them
+        place = {**good, "max_theta": 1.5, **bad}
+        focal = place.pop("focal")
+        for model in ("equidistant", "equisolid", "stereographic", "kannala_brandt"):
+            with pytest.raises(DataError, match="expected"):
+                fisheye_lens(model, fx=focal, fy=100.0, **place)
     with pytest.raises(DataError, match="finite"):
         Camera(Equidistant(**good), torch.tensor([0.0, math.nan, 0.0]), torch.eye(3))
+
+
+@pytest.mark.parametrize("size", [(0, 60), (60, 0), (-3, 60)])
+def test_42_cameras_windows_without_pixels_are_refused(size):
+    width, height = size
+    for lens in (Equidistant(100.0, 50.0, 50.0, 100, 100), Pinhole(90.0, 91.0, 50, 50, 100, 100)):
+        with pytest.raises(DataError, match="at least one pixel"):
+            resized(lens, width=width, height=height)
+        with pytest.raises(DataError, match="at least one pixel"):
+            cropped(lens, left=0, top=0, width=width, height=height)
+
+
+@pytest.mark.parametrize("focal", [{"focal_px": 0.0}, {"focal_px": 100.0, "focal_y_px": 0.0}])
+def test_42_cameras_rigs_without_a_focal_length_are_refused(focal):
+    with pytest.raises(DataError, match="focal > 0"):
+        Rig(1.2, 1.0, 100, 100, **focal).lens()

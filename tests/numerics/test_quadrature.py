@@ -178,6 +178,22 @@ def test_22_a_step_that_is_none_is_refused(step):
         RenderSettings(step_m=step)
 
 
+@pytest.mark.parametrize("depth", [0.0, -0.5, math.nan])
+def test_22_a_piece_without_depth_is_refused(depth):
+    with pytest.raises(ConfigError, match="piece_depth"):
+        RenderSettings(piece_depth=depth)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -0.5])
+@pytest.mark.parametrize(
+    "name", ["stop_transmittance", "colour_floor", "phase", "extent", "edge_rays"]
+)
+def test_22_settings_that_mean_nothing_are_refused(name, value):
+    """A colour_floor of NaN, for one, would give a black person without a word."""
+    with pytest.raises(ConfigError, match=name):
+        RenderSettings(**{name: value})
+
+
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 0.0], [math.nan, 0.0, 1.0], [math.inf, 0.0, 1.0]])
 def test_22_directions_that_point_nowhere_are_refused(direction):
     posed = ramp_ball()

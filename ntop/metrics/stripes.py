@@ -41,6 +41,11 @@ class LockIn:
     z: float
     pixels: int
 
+    @property
+    def judged(self) -> bool:
+        """Whether there were pixels enough to say anything; if not, both figures are 0."""
+        return self.pixels >= MIN_PIXELS
+
 
 @dataclass(frozen=True)
 class StripeScores:

@@ -29,6 +29,7 @@ from ntop.metrics.stripes import (
     MAX_AMPLITUDE,
     MAX_PHASE_SHIFT,
     MAX_Z,
+    MIN_PIXELS,
     StripeScores,
     high_passed,
     score_pair,
@@ -209,7 +210,8 @@ def stripe_comparison(checks: list[StripeCheck]) -> Comparison | None:
         "its significance z. All are the worst of a rig's views, in grey levels of 255; limits are "
         f"{MAX_PHASE_SHIFT:g} levels of rms, {MAX_AMPLITUDE:g} of amplitude, z below {MAX_Z:g}. "
         f"The paper's sampler ({SAMPLES} samples across the joints' box, no jitter) renders the "
-        "same avatars; its stripes are there with a pinhole as well."
+        "same avatars; its stripes are there with a pinhole as well. Views with fewer than "
+        f"{MIN_PIXELS} pixels well inside the person cannot be judged and count as 0."
     )
     return Comparison(text, tuple(pictures), Table(head, tuple(rows)))
 
@@ -279,9 +281,10 @@ def _of(check: StripeCheck, lens: str, sampler: str) -> dict[str, StripeScores]:
 
 
 def _row(name: str, found: dict[str, StripeScores]) -> tuple[str, ...]:
+    judged = sum(s.pixels >= MIN_PIXELS for s in found.values())
     return (
         name,
-        str(len(found)),
+        str(judged) if judged == len(found) else f"{judged} of {len(found)}",
         f"{max(s.phase_rms for s in found.values()):.2f}",
         f"{max(s.amplitude for s in found.values()):.3f}",
         f"{max(s.z for s in found.values()):.1f}",

@@ -1,5 +1,6 @@
 """`ntop stripes`: whether a rendered set has the sampler's stripes."""
 
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +11,19 @@ import torch
 from jaxtyping import Bool, Float
 
 from ntop.body.model import BodyModel, load_body_model
-from ntop.conventions import PIXEL_CENTRE, DataError
+from ntop.conventions import PIXEL_CENTRE, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
 from ntop.field.paper_sampler import paper_steps
 from ntop.field.rendering import RenderSettings, pose_avatar
-from ntop.metrics.stripes import MAX_AMPLITUDE, MAX_PHASE_SHIFT, MAX_Z, LockIn, high_passed, lock_in
+from ntop.metrics.stripes import (
+    MAX_AMPLITUDE,
+    MAX_PHASE_SHIFT,
+    MAX_Z,
+    MIN_PIXELS,
+    LockIn,
+    high_passed,
+    lock_in,
+)
 from ntop.report.capture import pose_of
 from ntop.report.stripes import pinhole_at, sampled_views, well_inside
 from ntop.storage import schemas
@@ -30,10 +39,14 @@ TABLES = {"manifest.parquet": schemas.MANIFEST, "renders.parquet": schemas.RENDE
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the output; `met` is whether it keeps every limit."""
+    """One line of the output; `met` is whether it keeps every limit, `judged` whether any is asked.
+
+    Nothing can be said of fewer than `MIN_PIXELS` pixels well inside the person.
+    """
 
     words: tuple[str, ...]
     met: bool
+    judged: bool = True
 
 
 def main(
@@ -54,11 +67,18 @@ def main(
     `folder` holds a manifest.parquet or a renders.parquet. Looks at `sets` sets of every rig and
     actor, evenly spread (0: all). `body_model`: SMPL file the avatars were trained with, if any.
     Grey levels are of 255. The exit code is 1 where a limit is not kept: image z below 4; phase
-    shift at most 0.37 rms, amplitude below 0.1 and z below 4. Reads only.
+    shift at most 0.37 rms, amplitude below 0.1 and z below 4. Views with fewer than 500 pixels
+    well inside the person are not judged, which their lines say. Reads only.
 
     Raises:
+        ConfigError: a step that is no positive length, or a negative number of sets.
         DataError: no readable table or images, or none of the avatars made these images.
     """
+    if sets < 0:
+        raise ConfigError(f"--sets {sets}: expected 1 or more, or 0 for all")
+    for step in steps_m or []:
+        if not 0 < step < math.inf:
+            raise ConfigError(f"--steps-m {step}: expected a positive length in metres")
     rows = rows_of(folder)
     chosen = spread_sets(rows, sets)
     settings = RenderSettings()
@@ -78,11 +98,17 @@ def main(
         if found is not None:
             lines += self_test_lines(key, views, avatar=found, model=model, settings=settings)
     show(lines)
-    bad = sum(not line.met for line in lines)
+    judged = [line for line in lines[1:] if line.judged]
+    bad = sum(not line.met for line in judged)
     sys.stdout.write(
-        f"{bad} of {len(lines) - 1} measurements exceed a limit: z < {MAX_Z:g}; of the self-test "
+        f"{bad} of {len(judged)} measurements exceed a limit: z < {MAX_Z:g}; of the self-test "
         f"also phase rms <= {MAX_PHASE_SHIFT:g} and amplitude < {MAX_AMPLITUDE:g}, of 255\n"
     )
+    if len(judged) < len(lines) - 1:
+        sys.stdout.write(
+            f"{len(lines) - 1 - len(judged)} are not judged: fewer than {MIN_PIXELS} pixels well "
+            "inside the person\n"
+        )
     return EXIT_STRIPED if bad else 0
 
 
@@ -134,7 +160,7 @@ def image_lines(
         for what, phase in phases.items():
             found = lock_in(signal, phase, mask)
             words = _words(key, row["view"], "fisheye", what)
-            yield Line((*words, "", *_figures(found)), found.z < MAX_Z)
+            yield Line((*words, "", *_figures(found)), found.z < MAX_Z, found.judged)
 
 
 def self_test_lines(
@@ -152,7 +178,8 @@ def self_test_lines(
             scores = views_by["ours"].scores
             words = _words(key, row["view"], lens, "self-test")
             found = LockIn(scores.amplitude, scores.z, scores.pixels)
-            yield Line((*words, f"{scores.phase_rms:.2f}", *_figures(found)), scores.met)
+            figures = f"{scores.phase_rms:.2f}", *_figures(found)
+            yield Line((*words, *figures), scores.met, found.judged)
 
 
 def body_of(row: Row) -> Row:
@@ -175,12 +202,12 @@ def paper_phase(
 
 
 def show(lines: list[Line]) -> None:
-    """Write an aligned table; a line beyond a limit ends with a mark."""
+    """Write an aligned table; a line beyond a limit, or that cannot be judged, says so."""
     columns = zip(*(line.words for line in lines), strict=True)
     widths = [max(map(len, column)) for column in columns]
     for line in lines:
         words = [word.ljust(width) for word, width in zip(line.words, widths, strict=True)]
-        words += [] if line.met else ["STRIPES"]
+        words += ["too few"] if not line.judged else [] if line.met else ["STRIPES"]
         sys.stdout.write("  ".join(words).rstrip() + "\n")
 
 

@@ -1,6 +1,7 @@
 """`ntop stripes` on shards whose sampler is known: ours, and the paper's."""
 
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from ntop.field.rendering import render_view
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.storage import schemas
 from ntop.storage.atomic import write_bytes
-from ntop.storage.images import write_depth, write_parts, write_rgba
+from ntop.storage.images import read_rgba, write_depth, write_parts, write_rgba
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import body_columns, image_paths, render_row
 from ntop.storage.tables import write_table
@@ -103,6 +104,28 @@ def test_wrong_folders_and_avatars_are_errors(shards, tmp_path, capsys):
     other = str(shards / "paper/avatar")
     assert main(["stripes", "--folder", str(shards / "plain"), "--avatar", other]) == 2
     assert "pass the folders of 4_train" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--steps-m", "0"], ["--steps-m", "nan"], ["--sets", "-1"]])
+def test_steps_and_numbers_that_are_none_are_refused(shards, words, capsys):
+    assert main(["stripes", "--folder", str(shards / "paper"), *words]) == 2
+    assert f"{words[0]} " in capsys.readouterr().err
+
+
+def test_a_view_with_too_few_pixels_is_not_said_to_be_free_of_stripes(shards, tmp_path, capsys):
+    """The paper's stripes, but of a person cut down to 20 x 20 pixels."""
+    folder = tmp_path / "small"
+    shutil.copytree(shards / "paper", folder)
+    for path in (folder / "images").rglob("*.png"):
+        rgba = read_rgba(path)
+        v, u = (int(x.mean()) for x in np.nonzero(rgba[..., 3] >= 255))
+        alpha = np.zeros(rgba.shape[:2])
+        alpha[v - 10 : v + 10, u - 10 : u + 10] = 1
+        write_rgba(rgba[..., :3] / 255, alpha, path=path)
+    assert main(["stripes", "--folder", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "0 of 0 measurements" in said and "4 are not judged" in said
+    assert said.count("too few") == 4
 
 
 def test_sets_are_spread_evenly():

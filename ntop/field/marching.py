@@ -66,10 +66,10 @@ def march_rays(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
 
 
 def march_on_cpu(scene: Scene, rays: Rays, rule: MarchRule) -> Seen:
-    """The same on all threads of the CPU."""
-    count = len(rays.directions)
-    colours, opacity = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-    depth, parts = np.empty(count, np.float32), np.empty(count, np.uint8)
+    """The same on all threads of the CPU; what is seen is as precise as the grid's values."""
+    count, precision = len(rays.directions), scene.grid.values.dtype
+    colours, opacity = np.empty((count, 3), precision), np.empty(count, precision)
+    depth, parts = np.empty(count, precision), np.empty(count, np.uint8)
     evaluations = np.zeros((-(-count // RAYS_PER_CHUNK), 2), np.int64)
     render_rays(
         scene.grid, scene.warp, scene.density, scene.sheets, scene.light, scene.labels.values,

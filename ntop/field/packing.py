@@ -46,14 +46,14 @@ def packed_scene(
 
 
 def packed_density(grid: CanonicalGrid) -> PackedDensity:
-    """Raw density by bricks; those that are empty, as rendering defines it, are the void's."""
+    """Raw density by bricks, as precise as the grid; empty ones, to rendering, are the void's."""
     dense = dense_voxels(grid, raw_threshold=EMPTY_RAW).cells
     bx, by, bz = grid.bricks.shape
     full = dense.reshape(bx, 4, by, 4, bz, 4).any(axis=(1, 3, 5))
     bricks = np.ascontiguousarray(np.argwhere(full))
     slots = np.zeros(full.shape, np.int32)
     slots[full] = np.arange(1, len(bricks) + 1)
-    raw = np.empty((len(bricks) + 1, NODES**3), np.float32)
+    raw = np.empty((len(bricks) + 1, NODES**3), grid.values.dtype)
     raw[0] = VOID_RAW
     pack_bricks(grid.tables(), bricks, raw[1:])
     return PackedDensity(slots, raw)
@@ -74,6 +74,6 @@ def packed_sheets(
     sheets = np.ascontiguousarray(np.argwhere(exists))
     rows = np.full(exists.shape, -1, np.int32)
     rows[exists] = np.arange(len(sheets))
-    corners = np.empty((len(sheets), 48), np.float32)
+    corners = np.empty((len(sheets), 48), grid.values.dtype)
     pack_sheets(grid, warp, sheets, corners)
     return PackedSheets(rows, corners)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.quadrature import doubled
+from benchmarks.skipping import paper
 from benchmarks.subjects import painted
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
@@ -55,6 +57,35 @@ def test_14_octants_judged_by_their_centres_lose_thin_limbs(margin, person):
     margin.mutant_exceeds("no margin", np.abs(mutant - whole).max(), 1e-6)
 
 
+def test_14_most_of_the_papers_samples_are_left_out(margin, person):
+    """18 views, one ray through each pixel's centre, as the paper has them."""
+    found = paper(person)
+    assert found["views"] == 18
+    margin.at_least("share of the paper's samples left out, mean of 18 views", found["mean"], 0.96)
+
+
+def test_14_every_level_measured_keeps_its_bound():
+    measured = json.loads((RESULTS / "skipping.json").read_text())
+    assert [row for row in measured["rows"] if row["within_bound"] is False] == []
+    assert min(row["mean"] for row in measured["paper"]) >= 0.96
+
+
+def test_27_the_reference_of_an_avatar_is_float64(person):
+    """It tells fields apart that are the same in float32: what is packed and seen is float64 too."""
+    camera = camera_of(person, "h1.0_r0.5", "e")
+    posed = doubled(person.posed(ONE_RAY))
+    v, u = np.nonzero(body_pixels(posed.warp, camera))
+    directions, valid = camera.rays(torch.from_numpy(np.stack([u, v], 1) + PIXEL_CENTRE))
+    finer = replace(posed, grid=replace(posed.grid, values=posed.grid.values * (1 + 1e-10)))
+    one, other = (
+        trace_rays(field, camera.center_world, directions[valid], settings=ONE_RAY)
+        for field in (posed, finer)
+    )
+    assert one.rgb.dtype == one.alpha.dtype == np.float64
+    for change in (np.abs(one.rgb - other.rgb), np.abs(one.alpha - other.alpha)):
+        assert 1e-13 < np.median(change[one.alpha > 0.02]) < 1e-9
+
+
 def test_27_the_default_preset_is_close_to_the_integral(margin, person):
     """The integral: float64, pieces of 0.2 mm, nothing skipped, no early stop."""
     differences = []
@@ -68,12 +99,9 @@ def test_27_the_default_preset_is_close_to_the_integral(margin, person):
         exact = RenderSettings(
             step_m=2e-4, stop_transmittance=0.0, colour_floor=0.0, cells=False, edge_rays=1
         )
-        doubled = person.posed(exact)
-        values = doubled.grid.values.astype(np.float64)
-        doubled = replace(doubled, grid=replace(doubled.grid, values=values))
         found = [
             trace_rays(one, camera.center_world, directions[valid], settings=settings)
-            for one, settings in ((posed, ONE_RAY), (doubled, exact))
+            for one, settings in ((posed, ONE_RAY), (doubled(person.posed(exact)), exact))
         ]
         ours, truth = (np.concatenate([f.rgb, f.alpha[:, None]], 1) for f in found)
         differences.append(255 * (ours - truth)[truth[:, 3] > 0.02])

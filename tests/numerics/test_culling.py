@@ -71,7 +71,7 @@ def test_14_every_level_measured_keeps_its_bound():
 
 
 def test_27_the_reference_of_an_avatar_is_float64(person):
-    """It tells fields apart that are the same in float32: what is packed and seen is float64 too."""
+    """It tells fields apart that are the same in float32: all that is packed and seen is finer."""
     camera = camera_of(person, "h1.0_r0.5", "e")
     posed = doubled(person.posed(ONE_RAY))
     v, u = np.nonzero(body_pixels(posed.warp, camera))

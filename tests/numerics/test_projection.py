@@ -90,9 +90,25 @@ def check_round_trip(lens, pixels, theta, margin):
     if pixels.dtype == torch.float64:
         margin.at_most(f"{lens.model} fp64", error.max().item(), 1e-11, "px")
     else:
-        scale = ulp(max(SIZE, pixels.abs().max().item()), pixels.dtype)
-        worst = (error / (scale * condition(theta))).max().item()
+        worst = (error / (pixel_ulp(pixels) * condition(theta))).max().item()
         margin.at_most(f"{lens.model} fp32, in ulp(W) x condition", worst, 8)
+
+
+def pixel_ulp(pixels):
+    """Spacing of numbers at each pixel's own coordinates, at least that at the image's width."""
+    exponents = pixels.abs().amax(-1).clamp(min=SIZE).log2().floor().double()
+    return torch.exp2(exponents) * torch.finfo(pixels.dtype).eps
+
+
+@pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.get)
+def test_01_far_outside_the_image_a_pixel_is_its_own_ruler(precision, margin):
+    """A stereographic 170 degrees at 2000 px per radian: one ulp is 7e-12 px, or 4e-3 px."""
+    [lens] = [one for one in family(2000.0) if isinstance(one, Stereographic)]
+    theta = torch.tensor([150.0, 160.0, 169.99]).double().deg2rad()[:, None].expand(-1, 400)
+    pixels = lens.project(directions(theta, azimuths(400)))[0].to(precision)
+    error, _ = round_trip(lens, pixels)
+    worst = (error / (pixel_ulp(pixels) * condition(theta))).max().item()
+    margin.at_most(f"stereographic {BITS[precision]}, in ulp x condition", worst, 8)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS, ids=BITS.get)

@@ -20,6 +20,8 @@ from ntop.geometry.kannala_brandt import KannalaBrandt
 from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigid import RigidTransform
 
+MAX_ROTATION_DEFECT = 1e-3  # of R R^T: calibrations are written with few digits
+
 Lens = Pinhole | Equidistant | Equisolid | Stereographic | KannalaBrandt
 
 
@@ -37,6 +39,14 @@ class Camera:
             raise DataError(
                 f"camera at {self.center_world.tolist()} m, camera_from_world "
                 f"{self.rotation.tolist()}; expected finite numbers"
+            )
+        exact = self.rotation.detach().double()
+        identity = torch.eye(3, dtype=torch.float64, device=exact.device)
+        defect = float((exact @ exact.T - identity).abs().max())
+        if defect > MAX_ROTATION_DEFECT or float(torch.linalg.det(exact)) < 0:
+            raise DataError(
+                f"camera_from_world {exact.tolist()} is no rotation: R R^T - 1 is {defect:.1e}, "
+                "expected orthogonal axes of length one that are not mirrored"
             )
 
     @property

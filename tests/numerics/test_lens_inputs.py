@@ -16,6 +16,7 @@ from ntop.geometry.monotone import monotone_limit
 from ntop.geometry.pinhole import Pinhole
 from ntop.geometry.rigs import Rig
 from ntop.geometry.windows import cropped, resized
+from ntop.report.stripes import pinhole_at
 from tests.numerics.lenses import PRECISIONS
 
 numbers = st.floats(allow_nan=True, allow_infinity=True, width=32)
@@ -119,3 +120,16 @@ def test_42_cameras_windows_without_pixels_are_refused(size):
 def test_42_cameras_rigs_without_a_focal_length_are_refused(focal):
     with pytest.raises(DataError, match="focal > 0"):
         Rig(1.2, 1.0, 100, 100, **focal).lens()
+
+
+@pytest.mark.parametrize("scale", [0.0, 2.0, -1.0, math.inf])
+def test_42_cameras_what_is_no_rotation_is_refused(scale):
+    lens = Equidistant(100.0, 50.0, 50.0, 100, 100)
+    with pytest.raises(DataError, match="expected"):
+        Camera(lens, torch.zeros(3), scale * torch.eye(3))
+
+
+def test_42_cameras_a_pinhole_that_looks_at_itself_is_refused():
+    camera = Camera(Equidistant(100.0, 50.0, 50.0, 100, 100), torch.ones(3), torch.eye(3))
+    with pytest.raises(DataError, match="no rotation"):
+        pinhole_at(camera, torch.ones(3))

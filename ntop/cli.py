@@ -9,6 +9,8 @@ import argparse
 import importlib
 import inspect
 import json
+import os
+import select
 import sys
 import types
 from collections.abc import Callable
@@ -23,14 +25,37 @@ from ntop.stages import STAGES, VERSIONS
 
 TOOLS = ("check", "fetch", "lease", "lens", "orphans", "plan", "status", "stripes")
 EXIT_USER_ERROR = 2
+EXIT_UNREAD = 141  # 128 + SIGPIPE: what a shell reports of `seq 100000` in `seq 100000 | head -1`
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb; an error meant for people ends with its text and exit code 2.
 
-    Otherwise the exit code is what the verb's `main` returns, 0 for None.
+    Otherwise the exit code is what the verb's `main` returns, 0 for None. Where nobody reads what
+    is printed any more (`| head -1`) it is 141, without a word.
     """
-    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        try:
+            return run_verb(sys.argv[1:] if arguments is None else arguments)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if not _output_is_unread():
+            raise
+        # what is still buffered would be written, and fail, once more when Python ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_UNREAD
+
+
+def _output_is_unread() -> bool:
+    """Whether standard output is a pipe whose reader has gone."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), select.POLLOUT)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+
+
+def run_verb(words: list[str]) -> int:
+    """The exit code of the verb that the first word names."""
     verbs = {name: f"ntop.stages.s{number}_{name}" for number, name, _ in STAGES}
     verbs |= {name: f"ntop.tools.{name}" for name in TOOLS}
     if not words or words[0] in {"-h", "--help"}:

@@ -1,4 +1,7 @@
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,7 @@ from ntop.config.sections import RenderConfig, TrainConfig
 from ntop.conventions import ConfigError
 from ntop.stages import VERSIONS
 
+ROOT = Path(__file__).parents[1]
 RIGS = {"a": {"height_above_pelvis_m": 1.0, "ring_radius_m": 0.5}}
 
 
@@ -79,3 +83,31 @@ def test_an_error_for_people_has_no_traceback(capsys, tmp_path):
     code = cli.main(["annotate", "--config", "{}", "--renders", str(tmp_path), "--out", "x"])
     assert code == cli.EXIT_USER_ERROR
     assert capsys.readouterr().err.startswith("ntop annotate: ")
+
+
+@pytest.mark.parametrize("words", [["lens"], []])
+def test_output_that_nobody_reads_ends_without_a_word(words):
+    reader, writer = os.pipe()
+    os.close(reader)  # as `head` does once it has its lines
+    done = subprocess.run(
+        [sys.executable, "-m", "ntop.cli", *words],
+        cwd=ROOT,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (cli.EXIT_UNREAD, "")
+
+
+def test_a_pipe_that_broke_elsewhere_is_not_hidden(monkeypatch):
+    def broken() -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("ntop.tools.orphans.main", broken)
+    reader, writer = os.pipe()
+    with os.fdopen(reader), os.fdopen(writer, "w") as read_by_somebody:
+        monkeypatch.setattr("sys.stdout", read_by_somebody)
+        with pytest.raises(BrokenPipeError):
+            cli.main(["orphans"])

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from ntop.storage import schemas
 from ntop.storage.keys import SetKey
 from ntop.storage.renders import set_key
-from ntop.storage.tables import Row, RowWriter, completed, open_table, row_writer
+from ntop.storage.tables import Row, RowWriter, completed, open_table, reading, row_writer
 
 ROWS_PER_GROUP = 4096  # a row takes about 10 kB in memory
 
@@ -26,7 +26,11 @@ def manifest_writer(folder: Path) -> AbstractContextManager[RowWriter]:
 
 
 class ManifestReader:
-    """The manifest of a dataset, read piece by piece: nothing grows with the number of images."""
+    """The manifest of a dataset, read piece by piece: nothing grows with the number of images.
+
+    Rows are checked as they are read: each method raises a DataError that names the file and what
+    to do where it meets damage.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Open `manifest.parquet` in a dataset's folder.
@@ -34,7 +38,8 @@ class ManifestReader:
         Raises:
             DataError: the file is missing, damaged, or has other columns than expected.
         """
-        self._file = open_table(folder / MANIFEST_NAME, schema=schemas.MANIFEST)
+        self._path = folder / MANIFEST_NAME
+        self._file = open_table(self._path, schema=schemas.MANIFEST)
 
     @property
     def num_rows(self) -> int:
@@ -44,7 +49,7 @@ class ManifestReader:
     def sets(self) -> Iterator[tuple[SetKey, range]]:
         """Each set with the numbers of its rows, in the manifest's order."""
         known, first, number = None, 0, 0
-        for batch in self._file.iter_batches(ROWS_PER_GROUP, columns=SET_COLUMNS):
+        for batch in self._batches(SET_COLUMNS):
             for row in batch.to_pylist():
                 key = set_key(row)
                 if key != known:
@@ -58,7 +63,7 @@ class ManifestReader:
     def numbers_of(self, sample_ids: Collection[str]) -> list[int]:
         """The numbers of the rows with these sample ids, ascending."""
         wanted, found, first = pa.array(list(sample_ids), pa.string()), [], 0
-        for batch in self._file.iter_batches(ROWS_PER_GROUP, columns=["sample_id"]):
+        for batch in self._batches(["sample_id"]):
             inside = pc.is_in(batch.column(0), wanted)
             found += (first + position for position in pc.indices_nonzero(inside).to_pylist())
             first += batch.num_rows
@@ -73,6 +78,11 @@ class ManifestReader:
             while left and left[0] < end:
                 inside.append(left.popleft() - first)
             if inside:
-                table = self._file.read_row_group(group).take(inside)
+                with reading(self._path):
+                    table = self._file.read_row_group(group).take(inside)
                 yield from completed(table, schemas.MANIFEST).to_pylist()
             first = end
+
+    def _batches(self, columns: list[str]) -> Iterator[pa.RecordBatch]:
+        with reading(self._path):
+            yield from self._file.iter_batches(ROWS_PER_GROUP, columns=columns)

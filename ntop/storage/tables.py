@@ -37,6 +37,21 @@ def write_table(rows: list[Row], *, schema: pa.Schema, path: Path) -> None:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what Arrow says of a damaged file into an error with its name and what to do.
+
+    A table that is opened shows its columns only: damaged rows are met when they are read.
+
+    Raises:
+        DataError: the block could not read the table.
+    """
+    try:
+        yield
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
+
+
 def read_table(path: Path, *, schema: pa.Schema) -> list[Row]:
     """Rows of a table, after a check of its schema.
 
@@ -52,10 +67,8 @@ def load_table(path: Path, *, schema: pa.Schema) -> pa.Table:
     Raises:
         DataError: the file is missing, truncated, or has other columns than expected.
     """
-    try:
+    with reading(path):
         table = pq.read_table(path, page_checksum_verification=True)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
     table = completed(table, schema)
     if table.schema.names != schema.names:
         raise DataError(
@@ -71,10 +84,8 @@ def open_table(path: Path, *, schema: pa.Schema) -> pq.ParquetFile:
     Raises:
         DataError: the file is missing or truncated, or has other columns than expected.
     """
-    try:
+    with reading(path):
         file = pq.ParquetFile(path, page_checksum_verification=True)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
     found = file.schema_arrow
     if completed(found.empty_table(), schema).schema.names != schema.names:
         raise DataError(
@@ -92,13 +103,10 @@ def read_columns(path: Path, names: Sequence[str], *, schema: pa.Schema) -> Iter
     Raises:
         DataError: the file is missing, damaged, or has other columns than expected.
     """
-    with open_table(path, schema=schema) as file:
+    with open_table(path, schema=schema) as file, reading(path):
         stored = [name for name in names if name in file.schema_arrow.names]
-        try:
-            for batch in file.iter_batches(columns=stored):
-                yield from batch.to_pylist()
-        except (OSError, pa.ArrowInvalid) as error:
-            raise DataError(f"cannot read table {path}: {error}; {remedy(path)}") from error
+        for batch in file.iter_batches(columns=stored):
+            yield from batch.to_pylist()
 
 
 class RowWriter:

@@ -1,10 +1,13 @@
+import shutil
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from ntop.config.tables import Actor
 from ntop.conventions import DataError
 from ntop.report.inputs import Dataset, ResultFolders
+from ntop.storage.manifest import ManifestReader
 
 
 def test_what_a_source_provides_lies_with_its_capture():
@@ -44,3 +47,28 @@ def test_rows_are_found_by_their_ids_beyond_the_sample(world):
     wanted = whole.rows[4::7]
     ids = [row["sample_id"] for row in wanted]
     assert list(sample.rows_with([*ids[::-1], "unknown"])) == list(wanted)
+
+
+@pytest.mark.parametrize(
+    ("column", "read"),
+    [
+        ("view", lambda manifest: list(manifest.rows([0, 7]))),
+        ("actor", lambda manifest: list(manifest.sets())),
+        ("sample_id", lambda manifest: manifest.numbers_of(["none"])),
+    ],
+)
+def test_damaged_rows_of_a_manifest_are_named_with_what_to_do(world, tmp_path, column, read):
+    """What Arrow sees only when it reads the rows: the file's end, with its columns, is whole."""
+    for name in ("manifest.parquet", "files.parquet"):
+        shutil.copy(world.dataset / name, tmp_path)
+    path = tmp_path / "manifest.parquet"
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    chunks = [group.column(index) for index in range(group.num_columns)]
+    chunk = next(chunk for chunk in chunks if chunk.path_in_schema == column)
+    content = bytearray(path.read_bytes())
+    first = chunk.dictionary_page_offset or chunk.data_page_offset
+    content[first + chunk.total_compressed_size - 1] ^= 0xA5  # the page's last byte
+    path.write_bytes(content)
+    manifest = ManifestReader(tmp_path)
+    with pytest.raises(DataError, match=rf"{path}: .*--forcerun {tmp_path}` added"):
+        read(manifest)

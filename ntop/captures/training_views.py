@@ -19,6 +19,7 @@ from ntop.storage import schemas
 from ntop.storage.cameras import read_cameras
 from ntop.storage.frames import iterate_frames
 from ntop.storage.images import read_matte
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row, read_table
 
 WATCH_EVERY = 10  # every tenth frame of the training cameras only says when to stop
@@ -134,7 +135,7 @@ def _crops(
         if matte.shape != picture.shape[:2]:
             raise DataError(
                 f"{mask['mask_path']}: matte {matte.shape}, picture {picture.shape[:2]}; "
-                "rerun the mask stage"
+                + remedy(tables.masks)
             )
         size = (camera.lens.width, camera.lens.height)
         if size != picture.shape[1::-1]:

@@ -16,6 +16,7 @@ from ntop.storage import schemas
 from ntop.storage.cameras import CameraKey, read_cameras
 from ntop.storage.frames import iterate_frames, read_frame
 from ntop.storage.images import read_matte
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row, read_table
 
 FrameKey = tuple[str, int, str]  # action, frame, view
@@ -57,7 +58,9 @@ class Recording:
         """Several pictures; every video is decoded once."""
         missing = sorted(set(keys) - set(self.frames))
         if missing:
-            raise DataError(f"{self._frame_table}: no usable frames {missing}; rerun capture")
+            raise DataError(
+                f"{self._frame_table}: no usable frames {missing}; {remedy(self._frame_table)}"
+            )
         rows = [self.frames[key] for key in keys]
         return {
             (row["action"], row["frame"], row["view"]): picture

@@ -16,6 +16,7 @@ from ntop.conventions import MASK_ALPHA, DataError
 from ntop.report.inputs import Dataset
 from ntop.storage.coco import read_coco
 from ntop.storage.images import read_rgba
+from ntop.storage.remedies import remedy
 from ntop.storage.renders import fisheye_camera
 from ntop.storage.sets import read_set
 
@@ -74,7 +75,8 @@ def annotation_files(dataset: Dataset) -> list[Path]:
     for kind in ANNOTATION_SIGMAS:
         found = sorted((dataset.folder / "annotations").glob(f"{kind}_*.json"))
         if not found:
-            raise DataError(f"{dataset.folder}/annotations: no {kind}_*.json; rerun assemble")
+            folder = dataset.folder / "annotations"
+            raise DataError(f"{folder}: no {kind}_*.json; {remedy(folder)}")
         files += found
     return files
 

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Float, Int
 
 from ntop.body.skeletons import SMPL24_NAMES
-from ntop.conventions import NUM_JOINTS, DataError
+from ntop.conventions import NUM_JOINTS
 from ntop.report.charts import Chart, Line, bar_chart, line_chart
+from ntop.storage import schemas
+from ntop.storage.tables import open_table, reading
 
 BATCH_ROWS = 4096
 SIZE_STEP_PX, SIZE_BINS = 10, 400  # boxes up to 4000 px, larger ones in the last bin
@@ -82,12 +83,9 @@ def read_contents(manifest: Path) -> Contents:
         DataError: it cannot be read.
     """
     contents = Contents()
-    try:
-        with pq.ParquetFile(manifest) as file:
-            for batch in file.iter_batches(BATCH_ROWS, columns=["persons"]):
-                contents.add(batch.column("persons").flatten())
-    except (OSError, pa.ArrowInvalid, KeyError) as error:
-        raise DataError(f"cannot read {manifest}: {error}; rerun the assemble stage") from error
+    with open_table(manifest, schema=schemas.MANIFEST) as file, reading(manifest):
+        for batch in file.iter_batches(BATCH_ROWS, columns=["persons"]):
+            contents.add(batch.column("persons").flatten())
     return contents
 
 

@@ -12,6 +12,7 @@ from ntop.report.inputs import ActorFolders, Dataset
 from ntop.report.page import Table
 from ntop.report.training import avatar_header, training_note
 from ntop.storage import schemas
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import read_table
 
 TILES = (
@@ -38,7 +39,7 @@ def read_dataset_record(dataset: Dataset) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise DataError(f"cannot read {path}: {error}; rerun the assemble stage") from error
+        raise DataError(f"cannot read {path}: {error}; {remedy(path)}") from error
 
 
 def headline(dataset: Dataset) -> str:
@@ -138,5 +139,5 @@ def provenance_rows(
 def _avatar_sha256(actor: ActorFolders) -> str:
     header = avatar_header(actor)
     if "sha256" not in header:
-        raise DataError(f"{actor.avatar}/avatar.json names no sha256; rerun the training")
+        raise DataError(f"{actor.avatar}/avatar.json names no sha256; {remedy(actor.avatar)}")
     return header["sha256"]

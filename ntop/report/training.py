@@ -12,6 +12,7 @@ from ntop.conventions import DataError
 from ntop.field.humannerf.avatar import CONVERGED_STEPS
 from ntop.report.charts import Chart, Line, line_chart
 from ntop.report.inputs import ActorFolders
+from ntop.storage.remedies import remedy
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def avatar_header(actor: ActorFolders) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise DataError(f"cannot read {path}: {error!r}; rerun the training") from error
+        raise DataError(f"cannot read {path}: {error!r}; {remedy(path)}") from error
 
 
 def _suffix(actor: ActorFolders) -> str:
@@ -101,4 +102,4 @@ def _curve(actor: ActorFolders) -> dict[str, list[float | None]]:
     try:
         return pq.read_table(path).to_pydict()
     except (OSError, pa.ArrowInvalid) as error:
-        raise DataError(f"cannot read {path}: {error}; rerun the training") from error
+        raise DataError(f"cannot read {path}: {error}; {remedy(path)}") from error

@@ -44,6 +44,7 @@ from ntop.storage.files import check_files, record_files
 from ntop.storage.frames import iterate_frames
 from ntop.storage.images import read_matte, write_matte
 from ntop.storage.pace import Pace
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row, read_table, write_table
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -208,7 +209,7 @@ def _read_plate(job: Job, rows: list[Row]) -> Picture:
         got = "no readable picture" if bgr is None else f"{bgr.shape[1]}x{bgr.shape[0]} px"
         raise DataError(
             f"background plate {path}: {got}, expected {size[1]}x{size[0]} px as the frames; "
-            "rerun the capture stage"
+            + remedy(path)
         )
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 

@@ -200,7 +200,7 @@ def sets_of(shard: Shard) -> Iterator[list[tuple[Row, Row]]]:
     if set(annotated) != {row["sample_id"] for row in renders}:
         raise DataError(
             f"{shard.annotations} annotates other samples than {shard.renders} holds; "
-            "rerun the annotate stage for this shard"
+            + remedy(shard.annotations)
         )
     for _, group in groupby(renders, key=set_key):
         views = sorted(group, key=lambda row: VIEWS.index(row["view"]))

@@ -55,6 +55,7 @@ from ntop.report.truth import score_truth, truth_comparison, truth_values
 from ntop.storage.atomic import atomic_folder
 from ntop.storage.files import check_files
 from ntop.storage.pace import paced
+from ntop.storage.remedies import remedy
 
 Values = dict[str, float | None]
 
@@ -201,7 +202,7 @@ def fit_values(actor: ActorFolders) -> Values:
     try:
         scores = json.loads(path.read_text())
     except ValueError as error:
-        raise DataError(f"{path} is not JSON: {error}; rerun the fit stage") from error
+        raise DataError(f"{path} is not JSON: {error}; {remedy(path)}") from error
     return scores
 
 

@@ -21,6 +21,7 @@ from ntop.body.skeletons import (
     SMPL24_SIGMAS,
 )
 from ntop.conventions import PIXEL_CENTRE, DataError
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row
 
 CATEGORY_ID = 1
@@ -177,11 +178,11 @@ def read_coco(path: Path, *, file_names: Container[str]) -> dict[str, Any]:
                 elif section == "annotations" and int(_between(line, '"image_id":', ",")) in ids:
                     document[section].append(json.loads(line.rstrip(",\n")))
     except (OSError, ValueError) as error:
-        raise DataError(f"cannot read {path}: {error}; rerun the assemble stage") from error
+        raise DataError(f"cannot read {path}: {error}; {remedy(path)}") from error
     if section != "annotations":
         raise DataError(
             f'{path}: no line that starts with "annotations"; expected one record per line, as '
-            "assemble writes them: it is cut off or was laid out anew, rerun the assemble stage"
+            f"assemble writes them: it is cut off or was laid out anew; {remedy(path)}"
         )
     return document
 

@@ -112,7 +112,7 @@ def _checked(picture: Picture, row: Row, path: Path) -> Picture:
     if (width, height) != (row["width"], row["height"]):
         raise DataError(
             f"{path} frame {row['image_index']}: picture is {width}x{height} px, its table says "
-            f"{row['width']}x{row['height']} px; rerun the capture stage"
+            f"{row['width']}x{row['height']} px; {remedy(path)}"
         )
     return picture
 

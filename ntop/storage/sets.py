@@ -10,6 +10,7 @@ from typing import Any
 
 from ntop.conventions import DataError
 from ntop.storage.files import content_row
+from ntop.storage.remedies import remedy
 from ntop.storage.tables import Row
 
 CAMERA_KEYS = (
@@ -66,7 +67,7 @@ def read_set(row: Row, *, folder: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise DataError(f"cannot read {path}: {error}; rerun the assemble stage") from error
+        raise DataError(f"cannot read {path}: {error}; {remedy(path)}") from error
 
 
 def write_set(record: dict[str, Any], *, folder: Path) -> Row:

@@ -44,5 +44,5 @@ def test_charts_show_shares_of_all_subjects(world):
 
 def test_an_unreadable_manifest_is_named(tmp_path):
     (tmp_path / "manifest.parquet").write_bytes(b"no table")
-    with pytest.raises(DataError, match=r"manifest\.parquet.*rerun the assemble stage"):
+    with pytest.raises(DataError, match=r"manifest\.parquet.*--forcerun"):
         read_contents(tmp_path / "manifest.parquet")

@@ -156,10 +156,16 @@ def find(name: str, stage: str) -> Kind:
 
 
 def deal(trials: int, seed: int) -> list[tuple[Kind, int]]:
-    """Disturbances for so many trials, each with a seed: every kind once, then quick ones again."""
+    """Disturbances for so many trials, each with a seed.
+
+    First each name once, at one of its stages, then the other stages, then quick ones again: a
+    short deck leaves out stages sooner than a kind of disturbance.
+    """
     chance = random.Random(seed)
-    deck = [kind for kind in [*QUICK, *SLOW] if not lacking(kind)]
-    chance.shuffle(deck)
+    kinds = [kind for kind in [*QUICK, *SLOW] if not lacking(kind)]
+    chance.shuffle(kinds)
+    first = list({kind.name: kind for kind in kinds}.values())
+    deck = [*first, *(kind for kind in kinds if kind not in first)]
     again = [kind for kind in QUICK if not lacking(kind)]
     while len(deck) < trials:
         deck.append(chance.choice(again))

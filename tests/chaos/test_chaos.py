@@ -2,7 +2,9 @@
 
 import pytest
 
+from tests.chaos import catalogue
 from tests.chaos.catalogue import IN_TESTS, QUICK, SLOW, deal, find, lacking
+from tests.chaos.slurm import SLURM_KINDS
 from tests.chaos.trial import run_trial
 
 SEED = 20261123
@@ -19,7 +21,15 @@ def test_a_disturbed_campaign_ends_with_the_same_dataset(campaign, tmp_path, nam
     assert outcome.survived, outcome
 
 
-def test_a_deck_holds_every_kind_and_depends_on_its_seed():
+def test_sixty_trials_hold_every_name_and_a_longer_deck_every_stage(monkeypatch):
+    monkeypatch.setattr(catalogue, "lacking", lambda _: "")  # also those that need root
+    nightly = [kind.name for kind, _ in deal(60 - len(SLURM_KINDS), 1)]
+    assert set(nightly) == {kind.name for kind in [*QUICK, *SLOW]}
+    longer = {(kind.name, kind.stage) for kind, _ in deal(len([*QUICK, *SLOW]), 1)}
+    assert longer == {(kind.name, kind.stage) for kind in [*QUICK, *SLOW]}
+
+
+def test_a_deck_depends_on_its_seed():
     deck = deal(80, 1)
     assert len(deck) == 80
     assert deck == deal(80, 1)

@@ -53,6 +53,19 @@ def test_every_dependency_is_pinned_in_the_constraints():
     assert {re.split(r"[<>=]", name)[0].lower() for name in wanted} <= pinned
 
 
+@pytest.mark.parametrize("name", ["default", "slurm"])
+def test_every_line_of_a_profile_is_explained(name):
+    profile = yaml.safe_load((ROOT / f"profiles/{name}/config.yaml").read_text())
+    page = (ROOT / "docs/running-on-slurm.md").read_text()
+    rows = page.partition(f"| line of `profiles/{name}/config.yaml` |")[2].partition("\n\n")[0]
+    explained = [line.split("|")[1] for line in rows.splitlines() if line.startswith("| `")]
+    for key, value in profile.items():
+        [cell] = [cell for cell in explained if re.search(rf"`{key}\b(?!-)", cell)]
+        if not isinstance(value, dict):
+            shown = f"[{', '.join(value)}]" if isinstance(value, list) else str(value).lower()
+            assert f"`{key}: {shown}`" in cell
+
+
 def test_no_machine_path_or_host_is_committed():
     hosts = "|".join(("pypi\\.o" + "rg", "pythonho" + "sted", "registry\\.np" + "mjs"))
     forbidden = re.compile(rf"(?<![\w./-])/(work|farm|root|home)/|{hosts}")

@@ -29,7 +29,7 @@ def work_folder(work: Path, *, recipe: dict[str, Any]) -> Iterator[Path]:
     published (`clear_work`).
 
     Raises:
-        DataError: another process holds the folder, or it cannot be written.
+        DataError: another process holds the folder, or it cannot be written or locked.
     """
     try:
         work.mkdir(parents=True, exist_ok=True)
@@ -45,8 +45,14 @@ def work_folder(work: Path, *, recipe: dict[str, Any]) -> Iterator[Path]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise DataError(
-                f"{work} is in use: the same job already runs on this machine; wait for it or "
-                "end it, then run the same command again"
+                f"{work} is in use: the same job already runs; wait for it or end it, then run the "
+                "same command again"
+            ) from error
+        except OSError as error:
+            raise DataError(
+                f"cannot lock {work / LOCK_NAME}: {error.strerror or error}; without locks two "
+                "jobs could write here at once: mount the file system with them (Lustre: -o flock) "
+                "or make results/work a link to a folder that has them"
             ) from error
         content, recipe_path = work / CONTENT_NAME, work / RECIPE_NAME
         text = canonical_json(recipe).encode()

@@ -1,5 +1,7 @@
 """Work folders: kept for one recipe, emptied for another, held by one process; SIGTERM noted."""
 
+import errno
+import fcntl
 import os
 import signal
 
@@ -38,6 +40,19 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
         work_folder(tmp_path / "file/work", recipe={}),
     ):
         pass
+
+
+def test_a_file_system_without_locks_is_a_clear_error(tmp_path, monkeypatch):
+    def refuse(*_):  # as Lustre does without `-o flock`, and NFS without a lock server
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with (
+        pytest.raises(DataError, match=r"cannot lock .*No locks available.*results/work a link"),
+        work_folder(tmp_path, recipe={}),
+    ):
+        pass
+    assert not (tmp_path / "recipe.json").exists()
 
 
 def test_sigterm_sets_the_flag_and_nothing_else():

@@ -45,6 +45,8 @@ bench-scale: env
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k files
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 100k tar
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) actors tar
+	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) short tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 570k tar
 	$(RUN) python -m benchmarks.scale record $(SCALE_FOLDER)
 
@@ -63,6 +65,7 @@ chaos: env
 bench: env
 	$(RUN) python -m benchmarks.quadrature
 	$(RUN) python -m benchmarks.skipping
+	$(RUN) python -m benchmarks.throughput
 	$(RUN) python scripts/write_benchmarks_page.py
 
 # quality over training time, grid and twin; hours on an idle machine, BENCH=--quick is a smoke test

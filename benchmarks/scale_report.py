@@ -21,6 +21,8 @@ PHASES = {
     "evaluate": "evaluate",
     "no_op": "no-op rerun",
 }
+SERIES = ("1k", "10k", "100k", "570k")  # of which exponents are taken
+OTHERS = {"actors": ", 43 actors", "short": ", 43 actors in short shards"}
 Campaigns = list[dict]
 
 
@@ -52,11 +54,16 @@ def exponents(campaigns: Campaigns) -> dict[str, dict[str, float]]:
             points = [
                 (c["images"], c[phase][key])
                 for c in campaigns
-                if c["storage"] == "tar" and key in c.get(phase, {})
+                if in_series(c) and key in c.get(phase, {})
             ]
             if len(points) > 1:
                 found.setdefault(phase, {})[key] = round(slope(points), 2)
     return found
+
+
+def in_series(campaign: dict) -> bool:
+    """Whether it differs from the others by its number of images only."""
+    return campaign["storage"] == "tar" and campaign["size"] in SERIES
 
 
 def slope(points: list[tuple[float, float]]) -> float:
@@ -70,7 +77,8 @@ def slope(points: list[tuple[float, float]]) -> float:
 def table(campaigns: Campaigns) -> str:
     """One line per phase, one column per campaign; then the files."""
     names = [
-        f"{c['images']:,} {c['storage']}" + ("" if c.get("executed", True) else " ¹")
+        f"{c['images']:,} {c['storage']}{OTHERS.get(c['size'], '')}"
+        + ("" if c.get("executed", True) else " ¹")
         for c in campaigns
     ]
     lines = [
@@ -118,7 +126,7 @@ def plot(campaigns: Campaigns, path: Path) -> None:
             points = [
                 (c["images"], c[phase][key])
                 for c in campaigns
-                if c["storage"] == "tar" and key in c.get(phase, {})
+                if in_series(c) and key in c.get(phase, {})
             ]
             if points:
                 power = slopes.get(phase, {}).get(key)

@@ -7,6 +7,7 @@ Where `make demo` has run, the avatars of its real and its studio source are mea
 
 import functools
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +62,12 @@ class Subject:
         """The nine views of a rig."""
         pelvis = torch.from_numpy(self.joints_world()[0])
         return top_view_cameras(Rig(*RIGS[rig], SIZE_PX, SIZE_PX, SIZE_PX / math.pi), pelvis)
+
+
+def chosen_results() -> Path | None:
+    """The results folder given on the command line or at hand, if a demo has trained in it."""
+    given = Path(sys.argv[1]) if sys.argv[1:] else Path("results")
+    return given if (given / "4_train").is_dir() else None
 
 
 def subjects(results: Path | None) -> list[Subject]:

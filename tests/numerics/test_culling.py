@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.quadrature import doubled
+from benchmarks.quadrature_errors import doubled
 from benchmarks.skipping import paper
 from benchmarks.subjects import painted
 from ntop.conventions import PIXEL_CENTRE

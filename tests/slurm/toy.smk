@@ -1,4 +1,5 @@
-# Small jobs for what the stages do not show: which GPU a job sees, and jobs that do not end.
+# Small jobs for what the stages do not show: which GPU a job sees, and jobs that do not end. The GPU
+# is asked for as the stages ask, through `ntop lease`, which leaves SLURM's choice alone.
 rule gpu:
     output:
         "gpu/{n}.txt",
@@ -8,7 +9,8 @@ rule gpu:
         other=lambda wildcards: {"a": "b", "b": "a"}[wildcards.n],
     # each waits for the other to have begun, so that both hold their GPU at the same time
     shell:
-        "echo ${{CUDA_VISIBLE_DEVICES-none}} > gpu/{wildcards.n}.begun;"
+        "ntop lease -n {resources.gpu} -- sh -c 'echo ${{CUDA_VISIBLE_DEVICES-none}}'"
+        " > gpu/{wildcards.n}.begun;"
         " until test -e gpu/{params.other}.begun; do sleep 0.1; done;"
         " cp gpu/{wildcards.n}.begun {output}"
 

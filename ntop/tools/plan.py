@@ -17,6 +17,7 @@ from ntop.tools.gpus import Gpus, asked_gpus
 DEFAULT_VIEWS_PER_S = 1.3
 DEFAULT_TRAIN_S = 200.0
 DEFAULT_BYTES_PER_IMAGE = 190e3
+DEFAULT_JOB_MINUTES = 30.0
 JOB_MINUTES = (10.0, 60.0)  # shorter: start-up tells; longer: time limits and lost work do
 
 
@@ -34,7 +35,7 @@ def main(
     out: Path,
     configfile: list[Path] | None = None,
     directory: Path = Path(),
-    minutes_per_job: float = 30.0,
+    minutes_per_job: float | None = None,
     views_per_s: float | None = None,
     refreeze: bool = False,
     profile: Path | None = None,
@@ -44,8 +45,9 @@ def main(
 
     Name the file as `plan` in the configuration; the workflow then takes its shards from it. The
     size of shards is chosen when the file is made, so that a render job lasts `minutes_per_job`
-    at the pace that earlier jobs in `directory` had (or `views_per_s`); later calls add new
-    sequences and keep it. `refreeze` starts anew. Give `profile` and `set_resources` as to
+    (30) at the pace that earlier jobs in `directory` had (or `views_per_s`); a configuration that
+    says `render.sets_per_shard` is followed, unless minutes are given. Later calls add new
+    sequences and keep the size. `refreeze` starts anew. Give `profile` and `set_resources` as to
     Snakemake: GPU-hours are the hours of the jobs that ask for GPUs there, times their number.
 
     Raises:
@@ -53,7 +55,7 @@ def main(
             minutes are outside 10 to 60.
         DataError: the file cannot be written.
     """
-    if not JOB_MINUTES[0] <= minutes_per_job <= JOB_MINUTES[1]:
+    if minutes_per_job is not None and not JOB_MINUTES[0] <= minutes_per_job <= JOB_MINUTES[1]:
         raise ConfigError(f"minutes_per_job {minutes_per_job}: expected {JOB_MINUTES[0]:.0f} to 60")
     run = load_files(configfile or [], directory=directory, frozen=False)
     pace = measured_pace(run, directory=directory, views_per_s=views_per_s)
@@ -65,7 +67,7 @@ def main(
 
 
 def frozen_plan(
-    run: Run, pace: Pace, *, gpus: Gpus, known: FrozenPlan | None, minutes_per_job: float
+    run: Run, pace: Pace, *, gpus: Gpus, known: FrozenPlan | None, minutes_per_job: float | None
 ) -> FrozenPlan:
     """The plan of a run; shards of a plan that is known already stay as they are.
 
@@ -82,7 +84,7 @@ def frozen_plan(
             )
         runs = known.runs | runs
         rigs = list(dict.fromkeys([*known.rigs, *rigs]))
-    size = known.sets_per_shard if known else best_size(pace, minutes_per_job)
+    size = known.sets_per_shard if known else chosen_size(run, pace, minutes_per_job)
     return FrozenPlan(
         dataset=run.config.dataset,
         sets_per_shard=size,
@@ -92,9 +94,13 @@ def frozen_plan(
     )
 
 
-def best_size(pace: Pace, minutes_per_job: float) -> int:
-    """Sets that a job renders in that time."""
-    return max(1, round(60 * minutes_per_job * pace.views_per_s / len(VIEWS)))
+def chosen_size(run: Run, pace: Pace, minutes_per_job: float | None) -> int:
+    """Sets a shard: as many as a job renders in those minutes, else what the configuration says."""
+    render = run.config.render
+    if minutes_per_job is None and "sets_per_shard" in render.model_fields_set:
+        return render.sets_per_shard
+    minutes = DEFAULT_JOB_MINUTES if minutes_per_job is None else minutes_per_job
+    return max(1, round(60 * minutes * pace.views_per_s / len(VIEWS)))
 
 
 def estimate(run: Run, sets_per_shard: int, pace: Pace, *, gpus: Gpus) -> Estimate:

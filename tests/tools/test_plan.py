@@ -57,6 +57,14 @@ def test_a_shard_lasts_as_long_as_asked(folder):
     assert found["estimate"]["minutes_per_job"] == 10.0
 
 
+def test_a_configured_size_is_followed_unless_minutes_are_given(folder):
+    write_tables(folder, actors=1, actions=1, frames=50)
+    sized = [folder.write("sized.yaml", "render: {sets_per_shard: 7}\n")]
+    assert freeze(folder, configfile=sized)["sets_per_shard"] == 7
+    found = freeze(folder, configfile=sized, refreeze=True, views_per_s=3.0, minutes_per_job=10)
+    assert found["sets_per_shard"] == 200
+
+
 def test_the_pace_is_that_of_finished_jobs(folder):
     write_tables(folder, actors=1, actions=1, frames=20)
     run = load_files([], directory=folder.folder)

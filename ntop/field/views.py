@@ -97,13 +97,13 @@ class RaySource:
         """`count` rays from `num_views` random views (with repetition)."""
         views = np.sort(generator.integers(0, len(self._pose), num_views))
         views = np.repeat(views, -(-count // num_views))[:count]
-        draws = generator.random((count, 8), np.float32)
+        draws = generator.random((count, 2), np.float32)
         poses, cameras = np.empty(count, np.int64), np.empty(count, np.int64)
         origins, directions = np.empty((count, 3)), np.empty((count, 3))
         targets, mattes = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         colour_weights, matte_weights = np.empty(count, np.float32), np.empty(count, np.float32)
         gather_rays(
-            draws[:, :4], views, self._pose, self._camera, self._boxes, self._pixel_offset,
+            draws, views, self._pose, self._camera, self._boxes, self._pixel_offset,
             self._pixels, self._inside_offset, self._inside, self._band_offset, self._band,
             self._shares, self._lookup_offset, self._lookup_size, self._lookup, LOOKUP_SPACING_PX,
             self._centres, self._pose_origins, poses, cameras, origins, directions, targets,
@@ -115,7 +115,7 @@ class RaySource:
             origins=origins,
             directions=directions,
             offsets=_spread(count, generator),
-            backgrounds=draws[:, 5:8].copy(),
+            backgrounds=generator.random((count, 3), np.float32),
             targets=targets,
             mattes=mattes,
             colour_weights=colour_weights,

@@ -8,7 +8,7 @@ STAGES = (
     (1, "capture", 1),
     (2, "mask", 1),
     (3, "fit", 2),
-    (4, "train", 3),
+    (4, "train", 4),
     (5, "render", 5),
     (6, "annotate", 1),
     (7, "assemble", 1),

@@ -4,6 +4,7 @@ import math
 
 import numba
 
+from ntop.conventions import PIXEL_CENTRE
 from ntop.field.kernels import kernel
 
 
@@ -17,7 +18,7 @@ def gather_rays(
     """Rays of one step; each ray uses only its own draws, so order does not matter.
 
     Args:
-        draws: (rays, 4) uniform: zone, pixel, jitter u, jitter v. views: (rays,) view of each.
+        draws: (rays, 2) uniform: zone, pixel. views: (rays,) view of each.
         view_pose, view_camera: (views,). view_box: (views, 4) left, top, width, height of the crop.
         pixel_offset: (views,) first pixel of the crop in `pixels` (any, 4) uint8 RGB + matte.
         inside_offset, inside, band_offset, band: (views + 1,) and crop pixel numbers, per zone.
@@ -55,9 +56,10 @@ def gather_rays(
         zones[r] = zone
         camera = view_camera[view]
         poses[r], cameras[r] = view_pose[view], camera
-        # the pixel's footprint is a unit square: draw anywhere in it
-        u = (left + pixel % width + draws[r, 2]) / spacing
-        v = (top + pixel // width + draws[r, 3]) / spacing
+        # Through the centre: a ray elsewhere in the pixel would be told the mean of the whole pixel,
+        # and the field would learn the photograph blurred once more (decision 0021).
+        u = (left + pixel % width + PIXEL_CENTRE) / spacing
+        v = (top + pixel // width + PIXEL_CENTRE) / spacing
         i = min(max(int(v), 0), lookup_size[camera, 0] - 2)
         j = min(max(int(u), 0), lookup_size[camera, 1] - 2)
         fv, fu = v - i, u - j

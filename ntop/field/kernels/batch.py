@@ -56,8 +56,8 @@ def gather_rays(
         zones[r] = zone
         camera = view_camera[view]
         poses[r], cameras[r] = view_pose[view], camera
-        # Through the centre: a ray elsewhere in the pixel would be told the mean of the whole pixel,
-        # and the field would learn the photograph blurred once more (decision 0021).
+        # Through the centre: rays elsewhere in the pixel would be told the mean of all of it, and
+        # the field would learn the photograph blurred once more (decision 0021).
         u = (left + pixel % width + PIXEL_CENTRE) / spacing
         v = (top + pixel // width + PIXEL_CENTRE) / spacing
         i = min(max(int(v), 0), lookup_size[camera, 0] - 2)

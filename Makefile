@@ -45,7 +45,6 @@ bench-scale: env
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 10k files
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 100k tar
-	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) actors tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) short tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 570k tar
 	$(RUN) python -m benchmarks.scale record $(SCALE_FOLDER)

@@ -3,7 +3,7 @@
 Every phase of a campaign's life is run as a user would and measured from outside; a phase that was
 measured already is not repeated, so an interrupted benchmark goes on where it was.
 
-Usage: python -m benchmarks.scale run FOLDER SIZE {files,tar} [--clone EXECUTED] [--work PLACE]
+Usage: python -m benchmarks.scale run FOLDER SIZE {files,tar} [--work PLACE]
        python -m benchmarks.scale record FOLDER
 """
 
@@ -20,14 +20,12 @@ from pathlib import Path
 
 from benchmarks.measuring import measured
 from benchmarks.scale_campaign import SOCKET, Campaign
-from benchmarks.scale_clone import clone
 
 SIZES = {  # actors, actions, frames
     "1k": (2, 1, 56),
     "10k": (1, 5, 246),
     "100k": (8, 6, 246),
     "570k": (43, 6, 246),
-    "actors": (43, 1, 56),  # as few images as actors allow: what memory follows
     "short": (43, 30, 49),  # many short shards: what jobs cost
 }
 PLAN_ONLY = ("short",)
@@ -84,7 +82,7 @@ class Run:
         )
 
 
-def run(folder: Path, size: str, storage: str, *, executed: Path | None, work: Path | None) -> None:
+def run(folder: Path, size: str, storage: str, *, work: Path | None) -> None:
     """Measure the life of one campaign, with its unfinished shards at `work` if that is given."""
     place = folder / f"{size}_{storage}"
     actors, actions, frames = SIZES[size]
@@ -100,16 +98,12 @@ def run(folder: Path, size: str, storage: str, *, executed: Path | None, work: P
         (place / "results/work").symlink_to(work)
     life = Run(campaign)
     life.phases["images"] = campaign.images
-    life.phases["executed"] = executed is None
     life.command("plan", ["ntop", "plan", "--out", "plan.json"])
     life.once("parse", lambda: parse(campaign))
     life.command("dry_run", [*SNAKEMAKE, "-n"])
     if size in PLAN_ONLY:
         return
-    if executed is None:
-        life.once("execute", lambda: execute(campaign))
-    elif not (place / "results").exists():
-        clone(place, executed)
+    life.once("execute", lambda: execute(campaign))
     target = "results/7_assemble/scale"
     cores = ["--cores", str(JOBS), "--"]
     life.command("assemble", [*SNAKEMAKE, *cores, target])
@@ -193,15 +187,13 @@ def main() -> None:
     one.add_argument("folder", type=Path)
     one.add_argument("size", choices=SIZES)
     one.add_argument("storage", choices=("files", "tar"))
-    one.add_argument("--clone", type=Path, metavar="EXECUTED")
     one.add_argument("--work", type=Path, metavar="PLACE", help="a folder in memory, say")
     all_ = verbs.add_parser("record")
     all_.add_argument("folder", type=Path)
     given = parser.parse_args()
     if given.verb == "run":
-        executed = given.clone.resolve() if given.clone else None
         work = given.work.resolve() if given.work else None
-        run(given.folder.resolve(), given.size, given.storage, executed=executed, work=work)
+        run(given.folder.resolve(), given.size, given.storage, work=work)
     else:
         from benchmarks.scale_report import record
 

@@ -22,7 +22,7 @@ PHASES = {
     "no_op": "no-op rerun",
 }
 SERIES = ("1k", "10k", "100k", "570k")  # of which exponents are taken
-OTHERS = {"actors": ", 43 actors", "short": ", 43 actors in short shards"}
+OTHERS = {"short": " in short shards"}
 Campaigns = list[dict]
 
 
@@ -76,11 +76,7 @@ def slope(points: list[tuple[float, float]]) -> float:
 
 def table(campaigns: Campaigns) -> str:
     """One line per phase, one column per campaign; then the files."""
-    names = [
-        f"{c['images']:,} {c['storage']}{OTHERS.get(c['size'], '')}"
-        + ("" if c.get("executed", True) else " ¹")
-        for c in campaigns
-    ]
+    names = [f"{c['images']:,} {c['storage']}{OTHERS.get(c['size'], '')}" for c in campaigns]
     lines = [
         "Processor seconds (wall seconds) · peak MB, all processes of the command together:",
         "",
@@ -103,8 +99,6 @@ def table(campaigns: Campaigns) -> str:
             for c in campaigns
         ]
         lines.append(f"| {title}: inodes · MB | " + " | ".join(cells) + " | |")
-    if not all(c.get("executed", True) for c in campaigns):
-        lines += ["", "¹ Results cloned from an executed shard: see below."]
     return "\n".join(lines)
 
 

@@ -16,8 +16,9 @@ moment of that stage; then its user repeats the command, and does what errors sa
 was damaged, an error (or `ntop check`) named it and what to do.
 
 Moments follow from progress (a process seen, sets finished) and the seed; a trial that comes too
-late is repeated. `make chaos TRIALS=60 SEED=7` makes this page; a dozen of the trials are part of
-`make test`.
+late is repeated. `make chaos` tries sixty, every kind of disturbance at least once, and writes this
+page; further ones are put in with `--merge` (`python -m tests.chaos --help`). A dozen of the trials
+are part of `make test`.
 
 What the suite has found, by its trials or while they were written, and what was mended since:
 

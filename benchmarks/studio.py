@@ -27,7 +27,7 @@ from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row, read_table
 from ntop.tools import fetch
 
-SOURCE = "studio"
+SOURCE = "pinned"
 CLIPS = "pybullet"
 MARGIN_M = 0.05  # of the crops around the body
 
@@ -50,8 +50,7 @@ def studio_capture(folder: Path, *, actor: str, packages: Path) -> Path:
     out = folder / actor
     if out.exists():
         return out
-    if not (packages / CLIPS).exists():
-        fetch.main(CLIPS, packages / CLIPS)
+    have_clips(packages)
     run = load_files([ROOT / "config/studio.yaml"], directory=ROOT)
     config = CaptureConfig(
         source_section=run.config.sources[SOURCE],
@@ -65,6 +64,12 @@ def studio_capture(folder: Path, *, actor: str, packages: Path) -> Path:
     )
     s1_capture.main(config, SOURCE, actor, packages=packages, out=out)
     return out
+
+
+def have_clips(packages: Path) -> None:
+    """Fetch the motions of the studio's actors where they are missing."""
+    if not (packages / CLIPS).exists():
+        fetch.main(CLIPS, packages / CLIPS)
 
 
 def capture_views(capture: Path, model: BodyModel) -> TrainingViews:

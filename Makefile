@@ -67,9 +67,13 @@ bench: env
 	$(RUN) python -m benchmarks.throughput
 	$(RUN) python scripts/write_benchmarks_page.py
 
-# quality over training time, grid and twin; hours on an idle machine, BENCH=--quick is a smoke test
+# quality over training time, grid and twin; what a capture's errors cost; what the error consists of;
+# hours on an idle machine, BENCH=--quick is a smoke test
 bench-field: env
 	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.field $(BENCH)
+	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.robustness $(BENCH)
+	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.budget $(BENCH)
+	$(RUN) python scripts/write_field_page.py
 
 # training and rendering on an NVIDIA GPU, a few minutes; PARTS="launches views" for some parts only
 bench-gpu: env

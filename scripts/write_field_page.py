@@ -1,0 +1,104 @@
+"""Write the field's sections of docs/benchmarks.md from benchmarks/results.
+
+A section whose benchmark was not run is left out, and so is a line whose point was not.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/benchmarks.md"
+RESULTS = ROOT / "benchmarks/results"
+START, END = "<!-- field -->\n", "<!-- gpu -->"
+
+
+def main() -> None:
+    """Replace what lies between the marks in the page."""
+    head, rest = PAGE.read_text().split(START)
+    PAGE.write_text(head + START + sections(RESULTS) + END + rest.split(END)[1])
+
+
+def sections(results: Path) -> str:
+    """All sections whose figures lie in the folder."""
+    lines = [""]
+    for name, section in (("robustness", robustness_lines), ("budget", budget_lines)):
+        path = results / f"{name}.json"
+        if path.exists():
+            lines += [*section(json.loads(path.read_text())), ""]
+    return "\n".join([*lines, ""])
+
+
+def robustness_lines(values: dict[str, Any]) -> list[str]:
+    """One line per point; the pinned capture is bold."""
+    lines = [
+        "## Robustness",
+        "",
+        f"`python -m benchmarks.robustness`: the studio's actor `plain`, {values['steps']} steps "
+        f"per point, {values['scored_views']} true views from above in novel poses. One thing at "
+        f"a time differs from the pinned capture (bold). {where(values)}",
+        "",
+        "![Robustness](../benchmarks/results/robustness.png)",
+        "",
+        "| axis | value | PSNR, box (dB) | mask IoU | median depth error (mm) |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for point in values["points"]:
+        value = f"{point['value']:g}"
+        scores = point["scores"]
+        depth_mm = scores["depth_error_mm"]
+        lines.append(
+            f"| {values['axes'][point['axis']]} | {f'**{value}**' if point['pinned'] else value} | "
+            f"{scores['psnr_box_db']:.2f} | {scores['mask_iou']:.4f} | "
+            f"{'' if depth_mm is None else f'{depth_mm:.1f}'} |"
+        )
+    return lines
+
+
+def budget_lines(values: dict[str, Any]) -> list[str]:
+    """One line per case, then where the base's error lies."""
+    lines = [
+        "## Error budget",
+        "",
+        "`python -m benchmarks.budget`: truth in place of one cause of the error at a time, "
+        f"{values['steps']} steps per training, views from above in novel poses. Core: the mask "
+        f"without its outermost 3 pixels. {where(values)}",
+        "",
+        "![Error budget](../benchmarks/results/budget.png)",
+        "",
+        "![Pictures of some cases](../benchmarks/results/budget_pictures.png)",
+        "",
+        "| case | part | substituted | box | person | core (dB) | IoU | against "
+        "| gained: box | person | core (dB) |",
+        "|---|---|---|---:|---:|---:|---:|---|---:|---:|---:|",
+    ]
+    names = ("psnr_box_db", "psnr_person_db", "psnr_core_db")
+    for case in values["cases"]:
+        own, gains = case["scores"], case["gain_db"]
+        gained = [f"{gains[name]:+.2f}" if gains else "" for name in names]
+        lines.append(
+            f"| {case['name']} | {case['part']} | {case['substituted']} | "
+            f"{' | '.join(f'{own[name]:.2f}' for name in names)} | {own['mask_iou']:.4f} | "
+            f"{case['against']} | {' | '.join(gained)} |"
+        )
+    error = values["base_error"]
+    return [
+        *lines,
+        "",
+        f"The base's error: {error['outline_share']:.0%} of its squared error in the box lies "
+        "outside the core. In the core, the slow part alone (shading, sigma 8 px) would leave "
+        f"{error['slow_db']:.1f} dB, the fine part alone {error['fine_db']:.1f} dB. Against the "
+        f"truth blurred by {error['blur_px']:.1f} px it is {error['blur_gain_db']:.1f} dB better; "
+        f"aligned with the truth by optical flow (median {error['flow_px']:.2f} px) "
+        f"{error['flow_gain_db']:.1f} dB.",
+    ]
+
+
+def where(values: dict[str, Any]) -> str:
+    """The machine."""
+    ran = values["environment"]
+    return f"On {ran['cores']} cores of {ran['cpu']}, commit {ran['commit']}."
+
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,7 @@ from benchmarks.environment import RESULTS, ROOT, write_result
 from benchmarks.error_parts import Diagnosis, Scores, diagnosis, scores
 from benchmarks.pictures import Studio, open_studio, true_views
 from benchmarks.studio import chosen_rows
-from ntop.field.avatar import Avatar, load_avatar, save_avatar
+from ntop.field.avatar import HEADER_NAME, Avatar, load_avatar, save_avatar
 from ntop.field.rendering import pose_avatar
 from ntop.metrics.images import Cutout
 from ntop.storage.atomic import write_bytes
@@ -135,7 +135,7 @@ def pairs(
 def kept_avatar(studio: Studio, case: Case, *, steps: int) -> Avatar:
     """The case's field: from disk, or made and kept."""
     folder = studio.work / "fields" / (case.field_name + ("" if case.filled else f"_{steps}"))
-    if not (folder / "avatar.json").exists():
+    if not (folder / HEADER_NAME).exists():
         save_avatar(case_avatar(studio, case, steps=steps), folder, write=write_bytes)
     return load_avatar(folder)
 

@@ -31,7 +31,7 @@ from benchmarks.robustness_plot import plot
 from benchmarks.studio import chosen_rows, score
 from ntop.captures.studio.recording import disturbed, grown, misplaced
 from ntop.config.sections import TrainConfig
-from ntop.field.avatar import Avatar, load_avatar, save_avatar
+from ntop.field.avatar import HEADER_NAME, Avatar, load_avatar, save_avatar
 from ntop.field.rendering import pose_avatar, render_view
 from ntop.field.training import train
 from ntop.field.views import TrainingViews
@@ -75,14 +75,14 @@ class Bench:
 
     def point(self, name: str, views: Callable[[], TrainingViews]) -> dict[str, Any]:
         """The scores of a finished point from disk, or train, score and keep it."""
-        folder = self.studio.work / "points" / f"{name}_{self.steps}"
-        path = folder / "point.json"
+        folder = self.studio.work / "fields" / f"{name}_{self.steps}"
+        path = folder / f"scores_{len(self.rows)}.json"
         if not path.exists():
-            settings = training_settings(TrainConfig(steps=self.steps))
-            avatar, _ = train(
-                views(), self.studio.actor.model, self.studio.betas, settings=settings
-            )
-            save_avatar(avatar, folder, write=write_bytes)
+            if not (folder / HEADER_NAME).exists():
+                settings = training_settings(TrainConfig(steps=self.steps))
+                model, betas = self.studio.actor.model, self.studio.betas
+                avatar, _ = train(views(), model, betas, settings=settings)
+                save_avatar(avatar, folder, write=write_bytes)
             scores = asdict(self._scores(load_avatar(folder)))
             write_bytes(path, json.dumps(scores, indent=1).encode())
         scores = json.loads(path.read_text())
@@ -111,7 +111,7 @@ def main() -> None:
     for axis in axes:
         for value in options.values(axis):
             same = value == axis.pinned
-            label = "pinned" if same else f"{axis.name}_{value:g}"
+            label = "base" if same else f"{axis.name}_{value:g}"
             scores = bench.point(label, lambda a=axis, v=value: varied(studio, a, v))
             points.append({"axis": axis.name, "value": value, "pinned": same, "scores": scores})
             values = {
@@ -125,7 +125,7 @@ def main() -> None:
 
 def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="few steps, the ends of each axis")
+    parser.add_argument("--quick", action="store_true", help="few steps, one value of each axis")
     parser.add_argument("--steps", type=int, help="of each training")
     parser.add_argument("--axes", nargs="+", default=[axis.name for axis in AXES])
     parser.add_argument("--packages", type=Path, default=ROOT / "data/packages")
@@ -136,12 +136,13 @@ def parsed() -> argparse.Namespace:
         parser.error(f"no axis {sorted(unknown)}, have {[axis.name for axis in AXES]}")
     options.steps = options.steps or (12 if options.quick else STEPS)
     options.actions = ["walk"] if options.quick else []
-    options.values = (lambda axis: (axis.pinned, axis.values[0])) if options.quick else _all_values
+    options.values = quick_values if options.quick else (lambda axis: axis.values)
     return options
 
 
-def _all_values(axis: Axis) -> tuple[int | float, ...]:
-    return axis.values
+def quick_values(axis: Axis) -> tuple[int | float, ...]:
+    """The pinned value and one other."""
+    return axis.pinned, next(value for value in axis.values if value != axis.pinned)
 
 
 def varied(studio: Studio, axis: Axis, value: int | float) -> TrainingViews:

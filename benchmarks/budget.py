@@ -5,7 +5,7 @@ is learning, by a grid into which the true textures are written. The base's erro
 outline, slow and fine parts. The cases and what each substitutes: benchmarks/budget_cases.py.
 
 Usage: python -m benchmarks.budget [--quick] [--steps N] [--cases NAME ...]
-Finished cases stay in --work; the same command goes on where it was stopped.
+Finished cases, and what was trained of the next, stay in --work; the same command goes on where it was stopped.
 """
 
 import argparse
@@ -30,9 +30,10 @@ from benchmarks.budget_cases import (
 from benchmarks.budget_plot import plot, strip
 from benchmarks.environment import RESULTS, ROOT, write_result
 from benchmarks.error_parts import Diagnosis, Scores, diagnosis, scores
+from benchmarks.fields import kept_field
 from benchmarks.pictures import Studio, open_studio, true_views
 from benchmarks.studio import chosen_rows
-from ntop.field.avatar import HEADER_NAME, Avatar, load_avatar, save_avatar
+from ntop.field.avatar import Avatar
 from ntop.field.rendering import pose_avatar
 from ntop.metrics.images import Cutout
 from ntop.storage.atomic import write_bytes
@@ -123,7 +124,7 @@ def pairs(
     truth = true_views(
         studio, case_truth(studio, case), rigs=1, settings=light_settings(studio, case)
     )
-    avatar, model = kept_avatar(studio, case, steps=steps), case_model(studio, case)
+    avatar, model = case_field(studio, case, steps=steps), case_model(studio, case)
     for view in VIEWS:
         for row in chosen_rows(truth, actions=actions, views=[view], rigs=1, sets=4):
             poses = body_pose_from_rows([row])
@@ -132,12 +133,10 @@ def pairs(
             yield image, Cutout.from_rgba(read_rgba(truth / "truth" / row["image_path"]))
 
 
-def kept_avatar(studio: Studio, case: Case, *, steps: int) -> Avatar:
+def case_field(studio: Studio, case: Case, *, steps: int) -> Avatar:
     """The case's field: from disk, or made and kept."""
     folder = studio.work / "fields" / (case.field_name + ("" if case.filled else f"_{steps}"))
-    if not (folder / HEADER_NAME).exists():
-        save_avatar(case_avatar(studio, case, steps=steps), folder, write=write_bytes)
-    return load_avatar(folder)
+    return kept_field(folder, lambda file: case_avatar(studio, case, steps=steps, checkpoint=file))
 
 
 def line(case: Case, found: dict[str, dict[str, Any]]) -> dict[str, Any]:

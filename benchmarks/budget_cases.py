@@ -5,6 +5,7 @@ A case is a choice of each; cases that share a capture, a truth or a field share
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -115,8 +116,8 @@ def case_truth(studio: Studio, case: Case) -> list[TruePose]:
     return [TruePose("turned", k, poses.at(k)) for k in range(4)]
 
 
-def case_avatar(studio: Studio, case: Case, *, steps: int) -> Avatar:
-    """The case's field, trained or filled."""
+def case_avatar(studio: Studio, case: Case, *, steps: int, checkpoint: Path) -> Avatar:
+    """The case's field, trained (on from the checkpoint, if there is one) or filled."""
     settings = field_settings(case, steps=steps)
     if case.filled:
         return filled_avatar(studio.actor, studio.betas, voxel_m=settings.voxels_m[-1])
@@ -133,8 +134,8 @@ def case_avatar(studio: Studio, case: Case, *, steps: int) -> Avatar:
         size = FINE_SCALE * source.image_size_px
         source = source.model_copy(update={"image_size_px": size})
     views = recorded_views(studio, poses, source)
-    avatar, _ = train(views, case_model(studio, case), studio.betas, settings=settings)
-    return avatar
+    model, betas = case_model(studio, case), studio.betas
+    return train(views, model, betas, settings=settings, checkpoint_path=checkpoint)[0]
 
 
 def field_settings(case: Case, *, steps: int) -> TrainingSettings:

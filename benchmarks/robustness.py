@@ -5,7 +5,7 @@ makes them (ntop/captures/studio/recording.py), fewer and more cameras, fewer an
 same motion. Every point is a training of the same length, scored on the same true views.
 
 Usage: python -m benchmarks.robustness [--quick] [--steps N] [--axes NAME ...]
-Finished points stay in --work; the same command goes on where it was stopped.
+Finished points, and what was trained of the next, stay in --work; the same command goes on where it was stopped.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.environment import RESULTS, ROOT, write_result
+from benchmarks.fields import kept_field
 from benchmarks.pictures import (
     Studio,
     motion_poses,
@@ -28,10 +29,10 @@ from benchmarks.pictures import (
     true_views,
 )
 from benchmarks.robustness_plot import plot
-from benchmarks.studio import chosen_rows, score
+from benchmarks.studio import Scores, chosen_rows, score
 from ntop.captures.studio.recording import disturbed, grown, misplaced
 from ntop.config.sections import TrainConfig
-from ntop.field.avatar import HEADER_NAME, Avatar, load_avatar, save_avatar
+from ntop.field.avatar import Avatar
 from ntop.field.rendering import pose_avatar, render_view
 from ntop.field.training import train
 from ntop.field.views import TrainingViews
@@ -78,18 +79,20 @@ class Bench:
         folder = self.studio.work / "fields" / f"{name}_{self.steps}"
         path = folder / f"scores_{len(self.rows)}.json"
         if not path.exists():
-            if not (folder / HEADER_NAME).exists():
-                settings = training_settings(TrainConfig(steps=self.steps))
-                model, betas = self.studio.actor.model, self.studio.betas
-                avatar, _ = train(views(), model, betas, settings=settings)
-                save_avatar(avatar, folder, write=write_bytes)
-            scores = asdict(self._scores(load_avatar(folder)))
+            scores = asdict(
+                self._scores(kept_field(folder, lambda file: self._trained(views(), file)))
+            )
             write_bytes(path, json.dumps(scores, indent=1).encode())
         scores = json.loads(path.read_text())
         print(name, scores, flush=True)
         return scores
 
-    def _scores(self, avatar: Avatar):
+    def _trained(self, views: TrainingViews, checkpoint: Path) -> Avatar:
+        model, betas = self.studio.actor.model, self.studio.betas
+        settings = training_settings(TrainConfig(steps=self.steps))
+        return train(views, model, betas, settings=settings, checkpoint_path=checkpoint)[0]
+
+    def _scores(self, avatar: Avatar) -> Scores:
         def show(pose, cameras):
             posed = pose_avatar(avatar, self.studio.actor.model, pose)
             return [render_view(posed, camera) for camera in cameras]

@@ -5,7 +5,8 @@ is learning, by a grid into which the true textures are written. The base's erro
 outline, slow and fine parts. The cases and what each substitutes: benchmarks/budget_cases.py.
 
 Usage: python -m benchmarks.budget [--quick] [--steps N] [--cases NAME ...]
-Finished cases, and what was trained of the next, stay in --work; the same command goes on where it was stopped.
+Finished cases, and what was trained of the next, stay in --work; the same command goes on where it
+was stopped.
 """
 
 import argparse

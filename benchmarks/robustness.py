@@ -5,7 +5,8 @@ makes them (ntop/captures/studio/recording.py), fewer and more cameras, fewer an
 same motion. Every point is a training of the same length, scored on the same true views.
 
 Usage: python -m benchmarks.robustness [--quick] [--steps N] [--axes NAME ...]
-Finished points, and what was trained of the next, stay in --work; the same command goes on where it was stopped.
+Finished points, and what was trained of the next, stay in --work; the same command goes on where it
+was stopped.
 """
 
 import argparse

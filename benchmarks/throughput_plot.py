@@ -29,15 +29,13 @@ def plot(values: dict) -> None:
         axis.set_ylim(bottom=0)
     axes[0].set_ylabel("ms of a core per view")
     whole = [row for row in values["cores"] if row["work"] == "labels"]
-    for name in values["subjects"]:
-        rows = [row for row in whole if row["subject"] == name and row["threads"] == 1]
-        cores = [row["processes"] for row in rows]
-        axes[-1].plot(cores, [row["views_per_s"] for row in rows], "o-", label=name)
+    rows = [row for row in whole if row["threads"] == 1]
+    cores = [row["processes"] for row in rows]
+    axes[-1].plot(cores, [row["views_per_s"] for row in rows], "o-", color=BLUE)
     axes[-1].set_xlabel("cores, a job on each")
     axes[-1].set_ylabel("views/s, with files and labels")
     axes[-1].set_xticks([1, 2])
     axes[-1].set_ylim(bottom=0)
-    axes[-1].legend(fontsize=7, frameon=False)
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()

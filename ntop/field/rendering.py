@@ -55,8 +55,8 @@ class RenderSettings:
         phase: Offset of all pieces, in steps, for the phase-shift self-test.
     """
 
-    step_m: float = 0.004
-    piece_depth: float = 0.5
+    step_m: float = 0.003
+    piece_depth: float = 1.0
     stop_transmittance: float = 1e-3
     colour_floor: float = 1e-3
     intervals: bool = True

@@ -9,7 +9,7 @@ STAGES = (
     (2, "mask", 1),
     (3, "fit", 2),
     (4, "train", 4),
-    (5, "render", 5),
+    (5, "render", 6),
     (6, "annotate", 1),
     (7, "assemble", 1),
     (8, "evaluate", 3),

@@ -154,7 +154,8 @@ def throughput_lines(values: dict) -> list[str]:
     ]
     lines += [
         "",
-        f"Scaling ({values['subjects'][-1]}, one core):",
+        f"Scaling ({values['subjects'][-1]}, one core; with labels, but fewer views of a pose are "
+        "rendered only):",
         "",
         "| axis | value | ms per view | MB |",
         "|---|---:|---:|---:|",

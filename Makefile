@@ -38,7 +38,7 @@ lint: env
 	$(RUN) snakemake --lint
 
 # a campaign's life at four sizes, hours on two cores; goes on where it was stopped
-SCALE_FOLDER ?= /tmp/ntop-scale
+SCALE_FOLDER ?= benchmarks/work/scale
 bench-scale: env
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 1k tar
 	$(RUN) python -m benchmarks.scale run $(SCALE_FOLDER) 1k files

@@ -1,6 +1,7 @@
 """Training on a ball: it learns, forgets nothing when interrupted, and saves what it learned."""
 
 import math
+from dataclasses import replace
 from itertools import chain, repeat
 
 import numpy as np
@@ -9,13 +10,14 @@ import torch
 
 from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
-from ntop.conventions import DataError
+from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.field.avatar import ARRAYS_NAME, load_avatar, save_avatar
 from ntop.field.progress import TrainingStoppedError
 from ntop.field.rendering import RenderSettings, pose_avatar, render_view
 from ntop.field.schedule import TrainingSettings
 from ntop.field.training import train
 from ntop.field.views import TrainingViews
+from ntop.field.watching import ray_source
 from ntop.geometry.cameras import Camera, Pinhole
 
 SETTINGS = TrainingSettings(
@@ -77,6 +79,23 @@ def views(model):
 
 def trained(views, model, **more):
     return train(views, model, (0.0,) * 10, settings=SETTINGS, **more)
+
+
+def test_a_ray_goes_through_the_centre_of_the_pixel_whose_colour_it_is_told(views):
+    """Anywhere else in the pixel it would be told the mean of all of it: a blur (decision 0021)."""
+    v, u = np.indices((60, 40), np.uint8)  # its own place in the crop as its colour
+    crop = np.stack([u, v, np.zeros_like(u), np.full_like(u, 255)], -1)
+    corner, camera = np.array([230, 200]), side_camera(0.0, size=512)
+    one = replace(
+        views, cameras=(camera,), crops=(crop,), boxes=np.array([[*corner, 40, 60]]),
+        camera_of_view=np.zeros(1, int), pose_of_view=np.zeros(1, int), watched=np.array([False]),
+    )  # fmt: skip
+    source = ray_source(one, ~one.watched, np.zeros((1, 3)), settings=SETTINGS)
+    rays = source.draw(400, num_views=1, generator=np.random.default_rng(0))
+    pixels, _ = camera.project(camera.center_world + torch.from_numpy(rays.directions))
+    told = np.rint(255 * rays.targets[:, :2]) + corner + PIXEL_CENTRE
+    assert len(np.unique(told, axis=0)) > 300
+    assert np.abs(pixels.numpy() - told).max() < 0.01
 
 
 def test_it_learns_the_colour_of_the_body(views, model):

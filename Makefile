@@ -70,6 +70,9 @@ bench: env
 # quality over training time, grid and twin; hours on an idle machine, BENCH=--quick is a smoke test
 bench-field: env
 	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.field $(BENCH)
+	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.poses
+	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.heldout
+	$(RUN) python scripts/write_poses_page.py
 
 # training and rendering on an NVIDIA GPU, a few minutes; PARTS="launches views" for some parts only
 bench-gpu: env

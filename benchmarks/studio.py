@@ -27,7 +27,7 @@ from ntop.storage.renders import fisheye_camera
 from ntop.storage.tables import Row, read_table
 from ntop.tools import fetch
 
-SOURCE = "studio"
+SOURCE = "pinned"
 CLIPS = "pybullet"
 MARGIN_M = 0.05  # of the crops around the body
 

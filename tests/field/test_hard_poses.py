@@ -36,7 +36,6 @@ VIEWS = ("centre", "s")
 ONE_RAY = RenderSettings(edge_rays=1)  # as the mesh is looked at
 VOXEL_M = 0.006
 REACH_M = 0.05
-AROUND_PX = 3
 HAND_LABELS = [SMPL24_NAMES.index(name) + 1 for name in ("left_hand", "right_hand")]
 
 
@@ -83,6 +82,11 @@ def posed(name: str) -> PosedAvatar:
     return pose_avatar(avatar, load_body_model(), hard_pose(name), settings=ONE_RAY)
 
 
+def view_of(name: str, camera: Camera) -> Rendering:
+    """The avatar in a pose."""
+    return render_view(posed(name), camera, settings=ONE_RAY)
+
+
 def cameras(name: str, **rig) -> dict[str, Camera]:
     """The views from above of a rig around the pose."""
     values = {"height_above_pelvis_m": 1.2, "ring_radius_m": 1.0, "max_theta_rad": math.pi / 2}
@@ -119,7 +123,11 @@ def test_pictures_from_above_are_whole(name):
         found = compare(
             render_view(posed(name), camera, settings=ONE_RAY), mesh_view(hard_pose(name), camera)
         )
-        print(name, view, found)
+        assert found["ghosts"] <= 12, (view, found)  # copies of elbows and knees had hundreds
+        assert found["holes"] <= 10, (view, found)
+        assert found["iou"] > 0.98, (view, found)
+        assert found["depth"] < 0.012, (view, found)
+        assert found["parts"] < 0.04, (view, found)  # borders between parts
 
 
 @pytest.mark.parametrize("name", HARD_POSES)
@@ -134,20 +142,22 @@ def test_skin_comes_back(name):
     points, truth = (np.einsum("nk,nkc->nc", shares, v[faces]) for v in (vertices, body.vertices))
     errors_m = np.nanmin(np.linalg.norm(ways_back(warp, points) - truth[:, None], axis=-1), axis=1)
     assert np.isfinite(errors_m).all()
-    print(name, (errors_m > 0.01).mean(), (errors_m > 0.001).mean())
+    assert (errors_m > 0.01).mean() < 0.006  # 1.7 % of a squat when cells lost a side of folds
+    assert (errors_m > 0.001).mean() < 0.025
 
 
 def test_hands_above_the_camera_are_in_the_picture():
     """A lens of more than 90 degrees sees them; one of 90 cannot."""
     name = "raised hands"
-    low = {"height_above_pelvis_m": 0.9, "ring_radius_m": 1.0}
-    camera = cameras(name, **low, max_theta_rad=math.radians(115))["s"]
-    truth = mesh_view(hard_pose(name), camera)
-    seen = render_view(posed(name), camera, settings=ONE_RAY)
-    above = truth.mask & np.isin(truth.parts, HAND_LABELS)
-    v, u = np.nonzero(above)
+    below = {"height_above_pelvis_m": 0.7, "ring_radius_m": 1.0}
+    camera = cameras(name, **below, max_theta_rad=math.radians(115))["s"]
+    truth, seen = mesh_view(hard_pose(name), camera), view_of(name, camera)
+    hands = np.isin(truth.parts, HAND_LABELS)
+    v, u = np.nonzero(hands)
     directions, _ = camera.rays(torch.from_numpy(np.stack([u, v], 1) + PIXEL_CENTRE))
-    above[v, u] = directions[:, 2].numpy() > 0  # the world's z is up
-    print(above.sum(), (seen.alpha[above] > 0.5).mean(), compare(seen, truth))
-    narrow = cameras(name, **low)["s"]
-    print(mesh_view(hard_pose(name), narrow).parts.max())
+    assert (directions[:, 2] > 0).all()  # the world's z is up
+    assert hands.sum() > 500
+    assert (seen.alpha[hands] >= 0.5).mean() > 0.93  # fingers are as thin as voxels
+    assert compare(seen, truth)["iou"] > 0.98
+    narrow = cameras(name, **below)["s"]
+    assert not np.isin(view_of(name, narrow).parts, HAND_LABELS).any()

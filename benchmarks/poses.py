@@ -173,7 +173,7 @@ def score_set(
         found = {
             "distance_mm": 1000 * float(away),
             "psnr_person_db": psnr_person_db(image, reference),
-            "mask_iou": mask_iou(image.mask, reference.mask),
+            "mask_iou": float(mask_iou(image.mask, reference.mask)),
             "depth_error_mm": 1000 * float(np.median(np.abs(depth_m - seen.depth_m)[both])),
         }
         scores.append(key | {name: round(value, 5) for name, value in found.items()})
@@ -199,7 +199,7 @@ def summary(scored: list[dict[str, Any]]) -> dict[str, Any]:
         found[metric] = {
             name: float(np.mean([s[metric] for s in group])) for name, group in groups.items()
         } | {
-            "per_10_mm": 10 * slope,
+            "per_100_mm": 100 * slope,
             "rank_correlation": float(spearmanr(distances, means).statistic),
         }
     return found

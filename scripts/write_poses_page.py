@@ -1,4 +1,4 @@
-"""Write the section on poses and cameras of docs/benchmarks.md from results/{poses,heldout}.json."""
+"""Write the novel poses and held-out cameras of docs/benchmarks.md from their results."""
 
 import json
 from pathlib import Path

@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.environment import RESULTS, ROOT
 
 PAGE = ROOT / "docs/benchmarks.md"
-START, END = "<!-- gpu -->\n", "<!-- tables -->"
+START, NEXT = "<!-- gpu -->\n", "<!-- "
 
 # what is claimed, its bar, the part of gpu.json and how it is shown
 Show = Callable[[dict[str, Any]], str]
@@ -37,7 +37,7 @@ def main() -> None:
     path = RESULTS / "gpu.json"
     values = json.loads(path.read_text()) if path.exists() else {}
     head, rest = PAGE.read_text().split(START)
-    PAGE.write_text(head + START + section(values) + END + rest.split(END)[1])
+    PAGE.write_text(head + START + section(values) + NEXT + rest.partition(NEXT)[2])
 
 
 def section(values: dict[str, Any]) -> str:

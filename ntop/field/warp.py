@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
-from ntop.field.canonical import CanonicalBody, Occupancy
+from ntop.field.canonical import CanonicalBody, Occupancy, vertex_normals
 from ntop.field.kernels.occupancy import octant_occupancy
 from ntop.field.kernels.posing import (
     nearest_vertices,
@@ -63,7 +63,8 @@ def pose_warp(
         )
     dims = nodes_along.astype(np.int64)
     vertices = vertices_world - origin
-    maps, normals = _vertex_maps(body, posed.posed_from_rest.numpy(), vertices, origin)
+    maps = _vertex_maps(body, posed.posed_from_rest.numpy(), vertices, origin)
+    normals = vertex_normals(vertices, body.faces)
 
     count = int(dims.prod())
     nearest = np.empty((2, count), np.int32)
@@ -74,9 +75,11 @@ def pose_warp(
     )  # fmt: skip
     candidates, nodes = np.nonzero(nearest >= 0)
     records = np.empty((len(nodes), 6), np.float32)
+    outside = np.empty(len(nodes), np.bool_)
     node_records(
         np.stack([nodes, candidates], 1), vertices, body.vertices, body.faces, body.ring_offsets,
-        body.ring_faces, maps, normals, dims, cell_m, nearest, distance, records,
+        body.ring_faces, maps, normals, body.normals, dims, cell_m, nearest, distance, records,
+        outside,
     )  # fmt: skip
     record_of = np.full((2, count), -1, np.int32)
     record_of[candidates, nodes] = np.arange(len(nodes))
@@ -88,8 +91,8 @@ def pose_warp(
     extra_count = np.empty(len(base), np.int32)
     extra = np.empty((len(base), EXTRA_PER_CELL, 6), np.float32)
     cell_sheets(
-        base, dims, cell_m, nearest, distance, record_of, records, maps, normals, reach_m,
-        APART_M, AGREE_M, sheets, extra_count, extra,
+        base, dims, cell_m, nearest, distance, record_of, records, outside, maps, normals,
+        body.vertices, body.normals, reach_m, AGREE_M, sheets, extra_count, extra,
     )  # fmt: skip
     first_extra = len(records) + np.concatenate([[0], np.cumsum(extra_count)[:-1]])
     extras = extra[np.arange(EXTRA_PER_CELL) < extra_count[:, None]]
@@ -194,21 +197,16 @@ def _vertex_maps(
     posed_from_rest: Float[np.ndarray, "24 4 4"],
     vertices: Float[np.ndarray, "vertex 3"],
     origin: Float[np.ndarray, " 3"],
-) -> tuple[Float[np.ndarray, "vertex 3 4"], Float[np.ndarray, "vertex 3"]]:
-    """Maps posed (relative to `origin`) -> canonical, and posed unit normals."""
+) -> Float[np.ndarray, "vertex 3 4"]:
+    """Maps posed (relative to `origin`) -> canonical."""
     bones = posed_from_rest.copy()
     bones[:, :3, 3] -= origin
     blended = (body.lbs_weights @ bones[:, :3].reshape(24, 12)).reshape(-1, 3, 4)
     maps = np.empty((len(vertices), 3, 4))
-    canonical_bones = (bones @ body.rest_from_canonical_bones)[:, :3]
     vertex_maps(
-        blended, body.canonical_from_rest, body.vertices, vertices, canonical_bones, body.parts,
-        maps,
-    )  # fmt: skip
-    # normals follow the inverse transpose of canonical -> posed, which is the transpose of `maps`
-    normals = (maps[:, :, :3] * body.normals[:, :, None]).sum(1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return maps, normals
+        blended, body.canonical_from_rest, body.vertices, vertices, bones[:, :3], body.parts, maps
+    )
+    return maps
 
 
 def _cells_near(squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: float) -> np.ndarray:

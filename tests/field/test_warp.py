@@ -10,8 +10,8 @@ from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.field.canonical import canonical_body
 from ntop.field.kernels.posing import nearest_vertices
-from ntop.field.kernels.tables import canonical_point
 from ntop.field.warp import joined, pose_warp
+from tests.field.ways_back import ways_back
 
 BETAS = (0.0,) * 10
 CELL_M, REACH_M = 0.02, 0.05
@@ -48,26 +48,13 @@ POSES = {
 }
 
 
-def way_back(warp, points_world):
-    """Canonical positions of world points per sheet of their cell: (points, 2, 3), NaN: none."""
-    tables = warp.tables
-    found = np.full((len(points_world), 2, 3), np.nan)
-    for n, point in enumerate((points_world - warp.origin_world) / warp.cell_m):
-        index = np.floor(point).astype(int)
-        cell = tables.cells[np.ravel_multi_index(index, tables.dims[0])]
-        for sheet in range(2):
-            if cell >= 0 and tables.sheets[cell, sheet, 0] >= 0:
-                found[n, sheet] = canonical_point(tables, cell, sheet, *(point - index))
-    return found
-
-
 @pytest.mark.parametrize("name", POSES)
 def test_skinned_points_come_back(name, model, body):
     pose = pose_of(POSES[name])
     warp = pose_warp(body, model, pose, cell_m=CELL_M, reach_m=REACH_M)
     chosen = np.arange(0, len(body.vertices), 7)
     vertices = pose_body(model, pose).vertices.numpy()[chosen]
-    errors = np.linalg.norm(way_back(warp, vertices) - body.vertices[chosen][:, None], axis=-1)
+    errors = np.linalg.norm(ways_back(warp, vertices) - body.vertices[chosen][:, None], axis=-1)
     best_mm = 1000 * np.nanmin(errors, axis=1)
     assert np.isfinite(best_mm).all()  # every surface point lies in a cell
     assert np.median(best_mm) < 0.2  # straight limbs are exact, up to float32 tables
@@ -87,7 +74,7 @@ def test_points_off_the_surface_keep_their_distance(model, body):
     normals = np.einsum("nij,njk,nk->ni", rotations, back, body.normals[rigid])
     points = posed.vertices.numpy()[rigid] + 0.03 * normals
     expected = body.vertices[rigid] + 0.03 * body.normals[rigid]
-    errors = np.linalg.norm(way_back(warp, points) - expected[:, None], axis=-1)
+    errors = np.linalg.norm(ways_back(warp, points) - expected[:, None], axis=-1)
     assert np.nanmedian(np.nanmin(errors, axis=1)) < 1e-3
 
 
@@ -101,7 +88,7 @@ def test_between_arm_and_trunk_both_ways_back_are_kept(model, body):
     a, t = np.unravel_index(np.argsort(gaps, axis=None)[:50], gaps.shape)
     assert gaps[a, t].max() < 2 * REACH_M  # the pose does bring them near each other
     middle = (vertices[arm[a]] + vertices[trunk[t]]) / 2
-    ways = way_back(warp, middle)
+    ways = ways_back(warp, middle)
     both = np.isfinite(ways).all((1, 2))
     assert both.mean() > 0.9
     spread = np.linalg.norm(ways[both, 0] - ways[both, 1], axis=-1)

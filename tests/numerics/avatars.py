@@ -24,12 +24,12 @@ FADE_PER_M = 60.0  # of raw colour: 3 grey levels per millimetre below the surfa
 CELL_M = 0.024
 
 
-@functools.lru_cache(maxsize=1)
-def analytic_avatar() -> Avatar:
+@functools.lru_cache(maxsize=2)
+def analytic_avatar(voxel_m: float = VOXEL_M) -> Avatar:
     """Raw density and raw colour are linear in the signed distance to the body's surface."""
     betas = (0.0,) * 10
     body = canonical_body(load_body_model(), betas)
-    distances, _, origin = distance_grid(body, spacing_m=VOXEL_M, reach_m=SHELL_M)
+    distances, _, origin = distance_grid(body, spacing_m=voxel_m, reach_m=SHELL_M)
     shape = [n // 4 for n in distances.shape]
     blocks = distances.reshape(shape[0], 4, shape[1], 4, shape[2], 4).transpose(0, 2, 4, 1, 3, 5)
     bricks, positions = number_bricks((np.abs(blocks) <= SHELL_M).any(axis=(3, 4, 5)))
@@ -39,7 +39,7 @@ def analytic_avatar() -> Avatar:
     values[64:, 1:] = (1 + FADE_PER_M * within)[:, None]
     light = np.zeros((9, 3), np.float32)
     light[0] = 1
-    grid = CanonicalGrid(values, bricks, positions, origin, VOXEL_M)
+    grid = CanonicalGrid(values, bricks, positions, origin, voxel_m)
     return Avatar(grid, light, betas, 0.03, 0)
 
 

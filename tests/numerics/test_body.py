@@ -16,10 +16,9 @@ from ntop.body.motions import Motion, sample_motion
 from ntop.body.skeletons import SMPL24_NAMES
 from ntop.body.skinning import BodyPose, pose_body, pose_joints
 from ntop.field.canonical import canonical_body
-from ntop.field.kernels.posing import MAX_STRETCH, vertex_maps, way_back
-from ntop.field.kernels.tables import canonical_point
+from ntop.field.kernels.posing import MIN_SCALE, vertex_maps, way_back
 from ntop.field.rendering import CELL_M
-from ntop.field.warp import PoseWarp, pose_warp
+from ntop.field.warp import pose_warp
 from ntop.geometry.rotations import (
     axis_angle_from_matrix,
     cross_matrix,
@@ -28,6 +27,7 @@ from ntop.geometry.rotations import (
     quaternion_from_matrix,
 )
 from ntop.geometry.triangulation import Triangulation
+from tests.field.ways_back import ways_back
 
 ANGLES_RAD = (
     0.0, 1e-12, 1e-8, 1e-4, 1e-3, 0.0099, 0.0101, 0.1, 1.0, math.pi / 2, 3.0, math.pi - 1e-2,
@@ -256,7 +256,7 @@ class Skin:
         bones_forward = bones @ body.rest_from_canonical_bones
         self.maps = np.empty((len(self.vertices), 3, 4))
         vertex_maps(
-            blend, body.canonical_from_rest, body.vertices, self.vertices, bones_forward[:, :3],
+            blend, body.canonical_from_rest, body.vertices, self.vertices, bones[:, :3],
             body.parts, self.maps,
         )  # fmt: skip
         weights = np.einsum("nk,nkj->nj", shares, body.lbs_weights[faces])
@@ -275,9 +275,9 @@ class Skin:
     def way_back(self, point: int, vertex: int) -> tuple[np.ndarray, float]:
         """The renderer's own inverse at one point: place, and distance to the skin (metres)."""
         body, record = self.body, np.empty(6)
-        squared = way_back(
+        squared, _ = way_back(
             self.points[point], vertex, self.vertices, body.vertices, body.faces,
-            body.ring_offsets, body.ring_faces, self.maps, body.normals, record,
+            body.ring_offsets, body.ring_faces, self.maps, body.normals, body.normals, record,
         )  # fmt: skip
         return record[:3], math.sqrt(squared)
 
@@ -295,20 +295,6 @@ class Skin:
             roots = np.array([place for place, distance in found if distance < 1e-9])
             best[n] = 1000 * np.linalg.norm(roots - self.truth[n], axis=1).min()
         return best
-
-
-def through_grid(warp: PoseWarp, points_world: np.ndarray) -> np.ndarray:
-    """Canonical places of world points by sheet of their cell: (point, 2, 3), NaN: no sheet."""
-    tables = warp.tables
-    found = np.full((len(points_world), 2, 3), np.nan)
-    for n, point in enumerate((points_world - warp.origin_world) / warp.cell_m):
-        index = np.floor(point).astype(int)
-        cell = tables.cells[np.ravel_multi_index(index, tables.dims[0])]
-        assert cell >= 0
-        for sheet in range(2):
-            if tables.sheets[cell, sheet, 0] >= 0:
-                found[n, sheet] = canonical_point(tables, cell, sheet, *(point - index))
-    return found
 
 
 POINT_LIMIT_MM = 0.1
@@ -336,35 +322,34 @@ def test_33_the_skin_comes_back_where_it_came_from(name, margin):
 
 
 @pytest.mark.parametrize("name", ["twist 150", "twist 180", "elbow 180"])
-def test_33_where_blending_collapses_the_map_is_a_rigid_bone(name, margin):
-    """The flag of a bad condition: the map turns into the main bone's, and stays finite."""
+def test_33_where_blending_collapses_the_map_is_bounded(name, margin):
+    """The flag of a bad condition: the map becomes a rotation of bounded stretch, and proper."""
     skin = Skin(name, count=10)
-    linear = skin.maps[..., :3]
     assert np.isfinite(skin.maps).all()
-    stretch = np.linalg.norm(linear, axis=(1, 2)) ** 2
-    margin.at_most("|inverse|^2 (3 is rigid)", stretch.max(), MAX_STRETCH)
+    stretches = np.linalg.svd(skin.maps[..., :3], compute_uv=False)
+    margin.at_most("largest stretch of the inverse", stretches.max(), 1.001 / MIN_SCALE)
     bad = skin.vertex_condition > 100
     if bad.any():
-        defect = np.abs(linear[bad] @ linear[bad].transpose(0, 2, 1) - np.eye(3)).max()
-        margin.at_most("defect of rigidity beyond condition 100", defect, 1e-12)
+        margin.at_least("least stretch beyond condition 100", stretches[bad].min(), 0.9)
+        margin.at_least("least volume beyond it", np.linalg.det(skin.maps[bad, :, :3]).min(), 0.9)
     assert skin.vertex_condition.max() > (100 if name.endswith("180") else 3)
 
 
 # what 12 mm cells with two correspondences cost: (95 %, shares of points beyond 0.1 and 10 mm);
-# at hard bends a cell's corners may all find one side of a fold, and the other is lost
+# where three sides of hard bends meet in a cell, or a fold is thinner than one, some are lost
 GRID_LIMITS_MM = {
     "elbow 30": (0.5, 0.25, 0.0),
     "elbow 60": (1.0, 0.35, 0.0),
-    "elbow 90": (4.0, 0.4, 0.03),
-    "elbow 120": (10.0, 0.4, 0.06),
-    "elbow 150": (30.0, 0.4, 0.10),
-    "elbow 180": (100.0, 0.4, 0.18),
+    "elbow 90": (3.0, 0.4, 0.01),
+    "elbow 120": (8.0, 0.4, 0.02),
+    "elbow 150": (10.0, 0.4, 0.05),
+    "elbow 180": (15.0, 0.4, 0.07),
     "twist 30": (0.5, 0.25, 0.0),
     "twist 60": (1.0, 0.35, 0.0),
     "twist 90": (3.0, 0.4, 0.005),
-    "twist 120": (6.0, 0.4, 0.02),
+    "twist 120": (5.0, 0.4, 0.01),
     "twist 150": (10.0, 0.4, 0.06),
-    "twist 180": (20.0, 0.4, 0.09),
+    "twist 180": (16.0, 0.4, 0.09),
 }
 GRID_MEDIAN_MM = 0.05
 
@@ -376,7 +361,7 @@ def test_33_the_grid_adds_its_interpolation(name, margin):
     assert np.isfinite(warp.tables.nodes).all()
     used = warp.tables.sheets[:, 0]
     assert ((used >= 0) & (used < len(warp.tables.nodes))).all()
-    error = np.nanmin(skin.error_mm(through_grid(warp, skin.points)), axis=1)
+    error = np.nanmin(skin.error_mm(ways_back(warp, skin.points)), axis=1)
     assert np.isfinite(error).all()
     most, beyond_stated, beyond_limb = GRID_LIMITS_MM[name]
     margin.at_most("warp grid, median, any bend", np.median(error), GRID_MEDIAN_MM, "mm")

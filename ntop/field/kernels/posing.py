@@ -10,21 +10,47 @@ import numpy as np
 
 from ntop.field.kernels import device, kernel
 
-MAX_STRETCH = 6.0  # of an inverse's squared Frobenius norm; 3 is rigid, beyond it is no use
+MIN_SCALE = 0.8  # what lies off the surface is not stretched by more than the inverse of this
+SAFE_STRETCH = 2 + MIN_SCALE**-2  # squared Frobenius norm of an inverse that cannot be beyond it
+MAIN_SHARE = 0.02  # of the main bone: it decides directions that blending has collapsed
+LEAST_RISE = 0.5  # of a point's distance from the skin: so far it stays above it at least
 TINY_VOLUME = 1e-6
+TINY_LENGTH = 1e-12
 SLAB = 4  # nodes along x that one task owns
+
+
+@device
+def bounded_inverse(linear, main, inverse):
+    """Inverse of a blended rotation, none of whose scales is taken below `MIN_SCALE`.
+
+    Where the blend has collapsed, what is left is the mean of the bones' rotations (the polar one);
+    `main`, the rotation of the vertex's main bone, decides where there is no mean.
+
+    Args:
+        linear, main: (3, 3). inverse: (3, 3) output.
+    """
+    left, scales, right = np.linalg.svd(linear + MAIN_SHARE * main)
+    mirrored = np.linalg.det(left) * np.linalg.det(right) < 0
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                sign = -1.0 if mirrored and k == 2 else 1.0
+                total += sign * right[k, i] * left[j, k] / max(scales[k], MIN_SCALE)
+            inverse[i, j] = total
 
 
 @kernel
 def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone, maps):
     """Per vertex the affine map posed -> canonical that sends the posed vertex to its own rest.
 
-    Where blending has collapsed (candy wrapper, hard bends), the vertex's main bone stands in,
-    rigidly: off the surface, the inverse would send points far away.
+    It is the inverse of skinning, but bounded (`bounded_inverse`): where blending collapses (candy
+    wrapper, the tip of a bent elbow), that would send what is off the surface far away, and one
+    bone's would turn it into the body.
 
     Args:
         blended: (V, 3, 4) this pose's blend, rest -> posed. canonical_from_rest: (V, 3, 4) blend.
-        canonical, posed: (V, 3) vertices, metres. bones: (24, 3, 4) rigid, canonical -> posed.
+        canonical, posed: (V, 3) vertices, metres. bones: (24, 3, 4) rigid, rest -> posed.
         main_bone: (V,). maps: (V, 3, 4) output.
     """
     for v in numba.prange(canonical.shape[0]):
@@ -44,22 +70,17 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
             inverse[1, 2] = (a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]) / det
             inverse[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]) / det
             stretch = (inverse * inverse).sum()
-        if stretch < MAX_STRETCH:
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for k in range(3):
-                        total += canonical_from_rest[v, i, k] * inverse[k, j]
-                    maps[v, i, j] = total
-        else:
-            bone = bones[main_bone[v]]
-            for i in range(3):
-                for j in range(3):
-                    maps[v, i, j] = bone[j, i]  # rigid: the inverse is the transpose
+        if not stretch < SAFE_STRETCH:
+            linear, main = a[:, :3].copy(), bones[main_bone[v], :, :3].copy()
+            bounded_inverse(linear, main, inverse)
         for i in range(3):
             moved = 0.0
             for j in range(3):
-                moved += maps[v, i, j] * posed[v, j]
+                total = 0.0
+                for k in range(3):
+                    total += canonical_from_rest[v, i, k] * inverse[k, j]
+                maps[v, i, j] = total
+                moved += total * posed[v, j]
             maps[v, i, 3] = canonical[v, i] - moved
 
 
@@ -186,20 +207,36 @@ def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces, weights)
 
 
 @device
-def way_back(p, v, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, record):
+def lift(place, height, foot, normal):
+    """Move a place (3) along a unit normal until it is `height` above the plane through `foot`."""
+    missing = height
+    for i in range(3):
+        missing -= (place[i] - foot[i]) * normal[i]
+    if missing > 0:
+        for i in range(3):
+            place[i] += missing * normal[i]
+
+
+@device
+def way_back(
+    p, v, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, canonical_normals,
+    record,
+):  # fmt: skip
     """Canonical position and world normal of a point, from the surface around vertex v closest.
 
     The closest surface point q goes back exactly, as the mean of its triangle's corners; what lies
     off it, p - q, follows the mean of their maps. (The mean of the corners' affine maps of p would
-    miss the surface between vertices, by a centimetre on a bent elbow's large triangles.)
+    miss the surface between vertices, by a centimetre on a bent elbow's large triangles.) What is
+    outside stays outside: beyond the tip of a bent knee, no mean of two bones' rotations suits all
+    directions, and some would lead into the leg again.
 
     Args:
         p: (3,) metres, as `posed`. v: vertex nearest to p (or nearest of one part).
-        posed, canonical, normals: (V, 3). maps: (V, 3, 4) posed -> canonical.
+        posed, canonical, normals, canonical_normals: (V, 3). maps: (V, 3, 4) posed -> canonical.
         record: (6,) output.
 
     Returns:
-        Squared distance of p to the surface.
+        Squared distance of p to the surface, and how far it is above it (negative: inside).
     """
     weights = np.empty(3, np.float64)
     face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
@@ -219,29 +256,38 @@ def way_back(p, v, posed, canonical, faces, ring_offsets, ring_faces, maps, norm
         x -= weights[corner] * posed[u, 0]
         y -= weights[corner] * posed[u, 1]
         z -= weights[corner] * posed[u, 2]
+    foot, upward = np.zeros(3, np.float64), np.zeros(3, np.float64)
     for i in range(3):
-        position, normal = 0.0, 0.0
+        offset, normal = 0.0, 0.0
         for corner in range(3):
             u = faces[face, corner]
             m = maps[u, i]
-            position += weights[corner] * (canonical[u, i] + m[0] * x + m[1] * y + m[2] * z)
+            foot[i] += weights[corner] * canonical[u, i]
+            upward[i] += weights[corner] * canonical_normals[u, i]
+            offset += weights[corner] * (m[0] * x + m[1] * y + m[2] * z)
             normal += weights[corner] * normals[u, i]
-        record[i] = position
+        record[i] = foot[i] + offset
         record[3 + i] = normal
-    return squared
+    height = x * record[3] + y * record[4] + z * record[5]
+    if height > 0:
+        length = math.sqrt(upward[0] ** 2 + upward[1] ** 2 + upward[2] ** 2)
+        for i in range(3):
+            upward[i] /= max(length, TINY_LENGTH)
+        lift(record, LEAST_RISE * math.sqrt(squared), foot, upward)
+    return squared, height
 
 
 @kernel
 def node_records(
-    node_ids, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, dims, cell,
-    nearest, distance, records,
+    node_ids, posed, canonical, faces, ring_offsets, ring_faces, maps, normals, canonical_normals,
+    dims, cell, nearest, distance, records, outside,
 ):  # fmt: skip
     """Canonical position and normal of each listed node, from the surface closest to it.
 
     Args:
         node_ids: (any, 2) node number and candidate (0, 1). Others: see `way_back`.
         distance: (2, nodes) squared metres; sharpened from vertex to surface distance.
-        records: (any, 6) output.
+        records: (any, 6) output. outside: (any,) output, whether the node is outside that surface.
     """
     for n in numba.prange(node_ids.shape[0]):
         node, candidate = node_ids[n, 0], node_ids[n, 1]
@@ -249,7 +295,8 @@ def node_records(
         p[0] = (node // (dims[1] * dims[2])) * cell
         p[1] = (node // dims[2] % dims[1]) * cell
         p[2] = (node % dims[2]) * cell
-        distance[candidate, node] = way_back(
+        distance[candidate, node], height = way_back(
             p, nearest[candidate, node], posed, canonical, faces, ring_offsets, ring_faces, maps,
-            normals, records[n],
+            normals, canonical_normals, records[n],
         )  # fmt: skip
+        outside[n] = height > 0

@@ -1,9 +1,12 @@
 """One or two consistent sheets of correspondences for each cell of a warp grid."""
 
+import math
+
 import numba
 import numpy as np
 
 from ntop.field.kernels import device, kernel
+from ntop.field.kernels.posing import LEAST_RISE, lift
 
 
 @device
@@ -15,21 +18,26 @@ def apply_map(m, x, y, z, out):
 
 @kernel
 def cell_sheets(
-    cell_ids, dims, cell, nearest, distance, record_of, records, maps, normals, reach, apart,
-    agree, sheets, extra_count, extra,
+    cell_ids, dims, cell, nearest, distance, record_of, records, outside, maps, normals,
+    canonical, canonical_normals, reach, agree, sheets, extra_count, extra,
 ):  # fmt: skip
     """One or two consistent sheets per cell, each with a canonical position at all 8 corners.
 
     A sheet starts at the corner that is closest to a surface; the map of that corner's vertex,
     applied to the other corners, predicts where they must lie. A corner whose own record disagrees
     (it is nearer to another part) gets the prediction instead, so that interpolation never mixes
-    two parts. The second sheet starts at the closest record that disagrees with the first.
+    two parts. The second sheet starts at the closest record that disagrees with the first: what the
+    first does not hold would be lost, even where the two are the sides of one fold.
+
+    A prediction goes on straight where the skin does not: beyond the tip of a bent elbow it would
+    enter the arm again. A corner outside the body is therefore outside on every sheet (`lift`).
 
     Args:
         cell_ids: (cells,) number of each cell's first node. record_of: (2, nodes) record or -1.
+        outside: (records,) whether a record's node is outside its surface.
+        canonical, canonical_normals: (V, 3) vertices and their unit normals.
         reach: surface distance (m) up to which a second sheet is kept.
-        apart, agree: canonical distances (m) from which records are of two sheets, and up to which
-            they are of one.
+        agree: canonical distance (m) up to which records are of one sheet.
         sheets: (cells, 2, 8): record number, or -2 - e for extra e of this cell (-1: no sheet).
         extra_count: (cells,). extra: (cells, 16, 6) output.
     """
@@ -59,7 +67,7 @@ def cell_sheets(
                         gap = 0.0
                         for a in range(3):
                             gap += (records[record, a] - predicted[a]) ** 2
-                        if gap < apart * apart:
+                        if gap < agree * agree:
                             continue
                     start, start_candidate, start_corner = (
                         distance[candidate, node],
@@ -91,6 +99,9 @@ def cell_sheets(
                 if chosen >= 0:
                     sheets[number, sheet, corner] = chosen
                 else:
+                    if record_of[0, node] >= 0 and outside[record_of[0, node]]:
+                        height = LEAST_RISE * math.sqrt(distance[0, node])
+                        lift(predicted, height, canonical[vertex], canonical_normals[vertex])
                     sheets[number, sheet, corner] = -2 - used
                     for a in range(3):
                         extra[number, used, a] = predicted[a]

@@ -1,35 +1,67 @@
-"""Which pixels of a view may see a posed avatar."""
+"""Which pixels of a view may see a posed avatar, and how far along their rays."""
 
+import functools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ntop.field.kernels.tables import HUGE
 from ntop.field.kernels.tiles import TILE_PX, mark_tiles
 from ntop.field.warp import PoseWarp
 from ntop.geometry.cameras import Camera, Lens
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What of an image may see a posed body, and how far along its rays (conservative).
+
+    `spans_m` are the nearest and the farthest length of tiles of TILE_PX, inf and -inf where
+    nothing is seen.
+    """
+
+    spans_m: Float[np.ndarray, "row column 2"]
+    width: int
+    height: int
+
+    @functools.cached_property
+    def mask(self) -> Bool[np.ndarray, "height width"]:
+        """Pixels that may see the body; whole tiles."""
+        marked = self.spans_m[..., 1] >= self.spans_m[..., 0]
+        return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[: self.height, : self.width]
+
+    def of_pixels(
+        self, v: Int[np.ndarray, " ray"], u: Int[np.ndarray, " ray"]
+    ) -> Float[np.ndarray, "ray 2"]:
+        """The lengths (m) between which the rays of pixels (row v, column u) may meet the body."""
+        return self.spans_m[v // TILE_PX, u // TILE_PX]
+
+
+def body_sight(warp: PoseWarp, camera: Camera) -> Sight:
+    """Where an image may see an occupied cell, by the cells that are not wholly inside others."""
+    width, height = camera.lens.width, camera.lens.height
+    offsets = (torch.from_numpy(warp.outer_centres_world) - camera.center_world) @ camera.rotation.T
+    distances = offsets.norm(dim=-1)
+    radius = warp.cell_m * math.sqrt(3) / 2
+    spans = np.empty((-(-height // TILE_PX), -(-width // TILE_PX), 2))
+    if len(offsets) and float(distances.min()) < 2 * radius:
+        spans[:] = 0.0, HUGE  # the camera is inside the body: every pixel may see it
+    else:
+        spans[:] = math.inf, -math.inf
+        pixels, radii_px, usable = _blots(offsets, torch.asin(radius / distances), camera.lens)
+        mark_tiles(
+            pixels.numpy(), radii_px.numpy(), usable.numpy(), (distances - radius).numpy(),
+            (distances + radius).numpy(), spans,
+        )  # fmt: skip
+    return Sight(spans, width, height)
+
+
 def body_pixels(warp: PoseWarp, camera: Camera) -> Bool[np.ndarray, "height width"]:
     """Pixels that may see an occupied cell (conservative; whole tiles)."""
-    width, height = camera.lens.width, camera.lens.height
-    tables, cell_m = warp.tables, warp.cell_m
-    cells = tables.cells
-    full = np.flatnonzero((cells >= 0) & (tables.occupancy[np.maximum(cells, 0)] != 0))
-    index = np.stack(np.unravel_index(full, tables.dims[0]), 1)
-    centres = torch.from_numpy((index + 0.5) * cell_m + warp.origin_world)
-    offsets = (centres - camera.center_world) @ camera.rotation.T
-    distances = offsets.norm(dim=-1)
-    radius = cell_m * math.sqrt(3) / 2
-    marked = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.uint8)
-    if len(full) and float(distances.min()) < 2 * radius:
-        marked[:] = 1  # the camera is inside the body: every pixel may see it
-    else:
-        pixels, radii_px, usable = _blots(offsets, torch.asin(radius / distances), camera.lens)
-        mark_tiles(pixels.numpy(), radii_px.numpy(), usable.numpy(), marked)
-    return np.repeat(np.repeat(marked, TILE_PX, 0), TILE_PX, 1)[:height, :width].astype(bool)
+    return body_sight(warp, camera).mask
 
 
 def _blots(

@@ -61,8 +61,8 @@ _SCENE = Uploads()  # an avatar is sent once, a pose once for all its views
 class ReadyMarch:
     """A march whose rays are on the GPU; one launch for all of them.
 
-    Beside the scene it holds 32 bytes of input per ray (24 more with an origin per ray, 8 with a
-    pose per ray) and 21 bytes of output.
+    Beside the scene it holds 32 bytes of input per ray (24 more with an origin per ray, 16
+    with a span, 8 with a pose) and 21 bytes of output.
     """
 
     def __init__(self, scene: Scene, rays: Rays, rule: MarchRule) -> None:

@@ -9,7 +9,7 @@ from ntop.field.canonical import PartLabels
 from ntop.field.devices import kernel_device
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.packed import PackedDensity, PackedSheets
-from ntop.field.kernels.tables import GridTables, WarpTables
+from ntop.field.kernels.tables import HUGE, GridTables, WarpTables
 
 
 class Scene(NamedTuple):
@@ -23,13 +23,20 @@ class Scene(NamedTuple):
     labels: PartLabels
 
 
+EVERYWHERE = np.array([[0.0, HUGE]])
+
+
 class Rays(NamedTuple):
-    """Unit directions; `poses` and `origins` (relative to the warp grid's) may hold one for all."""
+    """Unit directions; `poses`, `origins` and `spans` may hold one for all.
+
+    Origins are relative to the warp grid's; spans are lengths (m) outside of which nothing is.
+    """
 
     poses: Int[np.ndarray, " any"]
     origins: Float[np.ndarray, "any 3"]
     directions: Float[np.ndarray, "ray 3"]
     offsets: Float[np.ndarray, " ray"]
+    spans: Float[np.ndarray, "any 2"] = EVERYWHERE
 
 
 class MarchRule(NamedTuple):

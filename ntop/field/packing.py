@@ -55,8 +55,9 @@ def packed_density(grid: CanonicalGrid) -> PackedDensity:
     slots[full] = np.arange(1, len(bricks) + 1)
     raw = np.empty((len(bricks) + 1, NODES**3), grid.values.dtype)
     raw[0] = VOID_RAW
-    pack_bricks(grid.tables(), bricks, raw[1:])
-    return PackedDensity(slots, raw)
+    voxels = np.zeros((len(raw), 64), np.bool_)
+    pack_bricks(grid.tables(), bricks, raw[1:], voxels[1:])
+    return PackedDensity(slots, raw, voxels)
 
 
 def packed_sheets(

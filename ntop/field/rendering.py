@@ -1,6 +1,6 @@
 """Render a posed avatar through any camera: colour, opacity, depth and parts of every pixel.
 
-Only pixels that the projection of an occupied cell touches are marched; edges get four rays.
+Only pixels that the projection of an occupied cell touches are marched; edges get several rays.
 """
 
 import functools
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from ntop.body.model import BodyModel
@@ -24,11 +24,11 @@ from ntop.field.canonical import (
     dense_voxels,
     label_grid,
 )
-from ntop.field.culling import body_pixels, pixel_window
-from ntop.field.edges import EDGE_OFFSETS_PX, edge_pixels, middle_ray
+from ntop.field.culling import body_sight, pixel_window
+from ntop.field.edges import CONTRAST_OFFSETS_PX, OUTLINE_OFFSETS_PX, edge_pixels, middle_ray
 from ntop.field.kernels.packed import PackedDensity
 from ntop.field.kernels.tables import EMPTY_RAW
-from ntop.field.marching import MarchRule, Rays, Scene, march_rays
+from ntop.field.marching import EVERYWHERE, MarchRule, Rays, Scene, march_rays
 from ntop.field.packing import packed_density, packed_scene
 from ntop.field.straight import straight_colours
 from ntop.field.warp import PoseWarp, occupied, pose_warp, with_octants
@@ -51,7 +51,8 @@ class RenderSettings:
         cells: Jump over octants of cells in which the field is empty.
         extent: How much of an octant is asked whether it is empty; less than 1 may miss density.
         crop: March only pixels that may see the body.
-        edge_rays: 4: supersample edges; 1: one ray through every pixel's centre.
+        edge_rays: 4: so many rays more on outlines, half as many on contrasts; 1: one ray through
+            every pixel's centre.
         phase: Offset of all pieces, in steps, for the phase-shift self-test.
     """
 
@@ -228,8 +229,11 @@ def trace_rays(
     directions_world: Float[Tensor, "ray 3"],
     *,
     settings: RenderSettings,
+    spans_m: Float[np.ndarray, "any 2"] = EVERYWHERE,
 ) -> RayRendering:
     """Rays from one point, in any directions; their length says nothing.
+
+    `spans_m` are lengths (one pair, or one per ray) outside of which nothing is.
 
     Raises:
         DataError: a direction or the centre is no number, or the avatar's values are none.
@@ -237,7 +241,8 @@ def trace_rays(
     count = len(directions_world)
     origin = center_world.double().numpy() - posed.warp.origin_world
     directions = unit_directions(origin, directions_world.double().numpy())
-    rays = Rays(np.zeros(1, np.int64), origin[None], directions, np.full(count, settings.phase))
+    offsets = np.full(count, settings.phase)
+    rays = Rays(np.zeros(1, np.int64), origin[None], directions, offsets, spans_m)
     seen = march_rays(posed.scene, rays, settings.rule)
     if not (np.isfinite(seen.colours).all() and np.isfinite(seen.opacity).all()):
         raise DataError(
@@ -274,7 +279,8 @@ def render_view(
     alpha = np.zeros((height, width), np.float32)
     depth = np.zeros((height, width), np.float32)
     parts = np.zeros((height, width), np.uint8)
-    mask = body_pixels(posed.warp, camera) if settings.crop else np.ones((height, width), bool)
+    sight = body_sight(posed.warp, camera) if settings.crop else None
+    mask = sight.mask if sight else np.ones((height, width), bool)
     window = pixel_window(mask)
     left, top, columns, rows = window
     if columns == 0:
@@ -282,27 +288,75 @@ def render_view(
     inner = (slice(top, top + rows), slice(left, left + columns))
     v, u = np.nonzero(mask[inner])
     centres = np.stack([u + left, v + top], 1) + PIXEL_CENTRE
-    first = _trace_pixels(posed, camera, centres, settings=settings)
-    premultiplied = np.zeros((rows, columns, 3), np.float32)
-    box_alpha = np.zeros((rows, columns), np.float32)
-    premultiplied[v, u], box_alpha[v, u] = first.rgb, first.alpha
-    depth[v + top, u + left], parts[v + top, u + left] = first.depth_m, first.parts
-    voxels, samples = first.voxels, first.samples
+    spans_m = EVERYWHERE
+    if sight and settings.intervals:
+        spans_m = sight.of_pixels(v + top, u + left)
+    first = _trace_pixels(posed, camera, centres, settings=settings, spans_m=spans_m)
+    box = _Box(rows, columns, v, u)
     if settings.edge_rays > 1:
-        edges = edge_pixels(premultiplied, box_alpha)[v, u]
-        shifted = centres[edges][:, None] + np.array(EDGE_OFFSETS_PX)
-        more = _trace_pixels(posed, camera, shifted.reshape(-1, 2), settings=settings)
-        premultiplied[v[edges], u[edges]] = more.rgb.reshape(-1, 4, 3).mean(1)
-        box_alpha[v[edges], u[edges]] = more.alpha.reshape(-1, 4).mean(1)
-        chosen = np.arange(len(shifted)) * 4 + middle_ray(more.alpha, more.depth_m)
-        depth[v[edges] + top, u[edges] + left] = more.depth_m[chosen]
-        parts[v[edges] + top, u[edges] + left] = more.parts[chosen]
-        voxels, samples = voxels + more.voxels, samples + more.samples
-    rgb[inner] = straight_colours(premultiplied, box_alpha)
-    alpha[inner] = box_alpha
+        outline, contrast = edge_pixels(box.image(first.rgb), box.image(first.alpha))
+        for edges, offsets in ((outline, OUTLINE_OFFSETS_PX), (contrast, CONTRAST_OFFSETS_PX)):
+            chosen = np.flatnonzero(edges[v, u])
+            some = spans_m[chosen] if len(spans_m) > 1 else spans_m
+            first = _supersampled(
+                posed, camera, centres[chosen], first=first, chosen=chosen,
+                offsets_px=np.array(offsets), settings=settings, spans_m=some,
+            )  # fmt: skip
+    alpha[inner] = box.image(first.alpha)
+    rgb[inner] = straight_colours(box.image(first.rgb), alpha[inner])
+    depth[inner], parts[inner] = box.image(first.depth_m), box.image(first.parts)
     empty = np.rint(255 * alpha) < MASK_ALPHA
     depth[empty], parts[empty] = 0, 0
-    return Rendering(rgb, alpha, depth, parts, window, voxels, samples)
+    return Rendering(rgb, alpha, depth, parts, window, first.voxels, first.samples)
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A window of an image, and the places of rays in it."""
+
+    rows: int
+    columns: int
+    v: Int[np.ndarray, " ray"]
+    u: Int[np.ndarray, " ray"]
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Values (ray, ...) at their places, 0 elsewhere."""
+        image = np.zeros((self.rows, self.columns, *values.shape[1:]), values.dtype)
+        image[self.v, self.u] = values
+        return image
+
+
+def _supersampled(
+    posed: PosedAvatar,
+    camera: Camera,
+    centres: Float[np.ndarray, "pixel 2"],
+    *,
+    first: RayRendering,
+    chosen: Int[np.ndarray, " pixel"],
+    offsets_px: Float[np.ndarray, "ray 2"],
+    settings: RenderSettings,
+    spans_m: Float[np.ndarray, "any 2"],
+) -> RayRendering:
+    """The same rays; those of some pixels stand for more rays of theirs as well."""
+    rays = len(offsets_px)
+    pixels = (centres[:, None] + offsets_px).reshape(-1, 2)
+    if len(spans_m) > 1:
+        spans_m = np.repeat(spans_m, rays, 0)
+    more = _trace_pixels(posed, camera, pixels, settings=settings, spans_m=spans_m)
+    layers = ("rgb", "alpha", "depth_m", "parts")
+    everything = {}
+    for name in layers:
+        own, others = getattr(first, name), getattr(more, name)
+        both = others.reshape(len(chosen), rays, *others.shape[1:])
+        everything[name] = np.concatenate([own[chosen][:, None], both], 1)
+    middle = middle_ray(everything["alpha"], everything["depth_m"])
+    found = {name: getattr(first, name).copy() for name in layers}
+    for name in ("rgb", "alpha"):
+        found[name][chosen] = everything[name].mean(1)
+    for name in ("depth_m", "parts"):
+        found[name][chosen] = everything[name][np.arange(len(chosen)), middle]
+    cost = (first.voxels + more.voxels, first.samples + more.samples)
+    return RayRendering(*found.values(), *cost)
 
 
 def _trace_pixels(
@@ -311,10 +365,14 @@ def _trace_pixels(
     pixels: Float[np.ndarray, "ray 2"],
     *,
     settings: RenderSettings,
+    spans_m: Float[np.ndarray, "any 2"],
 ) -> RayRendering:
     directions, valid = camera.rays(torch.from_numpy(pixels))
     kept = valid.numpy()
-    found = trace_rays(posed, camera.center_world, directions[valid], settings=settings)
+    found = trace_rays(
+        posed, camera.center_world, directions[valid], settings=settings,
+        spans_m=spans_m[kept] if len(spans_m) > 1 else spans_m,
+    )  # fmt: skip
     if kept.all():
         return found
     spread = []

@@ -5,6 +5,7 @@ transform back. This is exact on the surface and continuous off it until another
 is nearer; there a cell keeps two *sheets*, one per part, and the renderer takes the denser.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -23,11 +24,13 @@ from ntop.field.kernels.posing import (
 )
 from ntop.field.kernels.sheets import cell_sheets
 from ntop.field.kernels.tables import WarpTables
+from ntop.field.kernels.tiles import outer_cells
 
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
 MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
+BLOCK = 4  # cells; distances to what is occupied are counted in blocks beyond the next ones
 MAX_AWAY = 8  # blocks; how far a ray may jump over empty space at once
 STRETCH = 1.2  # of canonical lengths against posed ones that occupancy allows for
 
@@ -39,6 +42,18 @@ class PoseWarp:
     tables: WarpTables
     origin_world: Float[np.ndarray, " 3"]
     cell_m: float
+
+    @functools.cached_property
+    def outer_centres_world(self) -> Float[np.ndarray, "cell 3"]:
+        """Centres (m) of the occupied cells that have a neighbour which is not.
+
+        A ray from outside meets one of them before it meets any other, and after.
+        """
+        tables = self.tables
+        outer = np.empty(len(tables.cells), np.bool_)
+        outer_cells(tables.cells, tables.occupancy, tables.dims[0], outer)
+        index = np.stack(np.unravel_index(np.flatnonzero(outer), tables.dims[0]), 1)
+        return (index + 0.5) * self.cell_m + self.origin_world
 
 
 def pose_warp(
@@ -100,13 +115,12 @@ def pose_warp(
     tables = WarpTables(
         dims=(dims - 1)[None],
         cell_offset=np.zeros(1, np.int64),
-        block_offset=np.zeros(1, np.int64),
         inverse_cell=1 / cell_m,
         cells=cells.ravel(),
         sheets=sheets.astype(np.int32),
         nodes=np.concatenate([records, extras]),
         occupancy=np.zeros(len(base), np.uint8),
-        blocks=np.zeros(int(np.prod((dims + 2) // 4)), np.uint8),
+        away=np.zeros(cells.size, np.uint8),
     )
     return PoseWarp(tables, origin, cell_m)
 
@@ -127,8 +141,8 @@ def occupied(tables: WarpTables, occupancy: Occupancy, *, extent: float = 0.0) -
 def with_octants(tables: WarpTables, octants: UInt8[np.ndarray, " cell"]) -> WarpTables:
     """The same warps with these octants to look at."""
     poses = range(len(tables.dims))
-    blocks = np.concatenate([_blocks(tables, octants, p) for p in poses])
-    return tables._replace(occupancy=octants, blocks=blocks)
+    away = np.concatenate([_away(tables, octants, p) for p in poses])
+    return tables._replace(occupancy=octants, away=away)
 
 
 def octant_radius_m(cell_m: float) -> float:
@@ -143,7 +157,6 @@ def joined(tables: list[WarpTables]) -> WarpTables:
     return WarpTables(
         dims=np.concatenate([t.dims for t in tables]),
         cell_offset=np.cumsum([0] + [len(t.cells) for t in tables])[:-1],
-        block_offset=np.cumsum([0] + [len(t.blocks) for t in tables])[:-1],
         inverse_cell=tables[0].inverse_cell,
         cells=np.concatenate(
             [
@@ -159,7 +172,7 @@ def joined(tables: list[WarpTables]) -> WarpTables:
         ).astype(np.int32),
         nodes=np.concatenate([t.nodes for t in tables]),
         occupancy=np.concatenate([t.occupancy for t in tables]),
-        blocks=np.concatenate([t.blocks for t in tables]),
+        away=np.concatenate([t.away for t in tables]),
     )
 
 
@@ -181,13 +194,12 @@ def identity_warp(
     tables = WarpTables(
         dims=dims[None],
         cell_offset=np.zeros(1, np.int64),
-        block_offset=np.zeros(1, np.int64),
         inverse_cell=1 / cell_m,
         cells=np.arange(dims.prod(), dtype=np.int32),
         sheets=sheets,
         nodes=records.reshape(-1, 6),
         occupancy=np.zeros(dims.prod(), np.uint8),
-        blocks=np.zeros(int(np.prod((dims + 3) // 4)), np.uint8),
+        away=np.zeros(dims.prod(), np.uint8),
     )
     return PoseWarp(tables, low_world.astype(np.float64), cell_m)
 
@@ -223,19 +235,32 @@ def _cells_near(squared: Float[np.ndarray, "x y z"], reach_m: float, cell_m: flo
     )
 
 
-def _blocks(tables: WarpTables, occupancy: np.ndarray, pose: int) -> np.ndarray:
-    """How many blocks away the nearest occupied block is, per block, at most MAX_AWAY."""
+def _away(tables: WarpTables, occupancy: np.ndarray, pose: int) -> np.ndarray:
+    """How many cells away the nearest occupied cell is at least, per cell; see `WarpTables`.
+
+    Near ones are counted cell by cell, the others by blocks of BLOCK.
+    """
     dims = tables.dims[pose]
     cells = tables.cells[tables.cell_offset[pose] :][: dims.prod()].reshape(dims)
-    full = np.zeros(4 * ((dims + 3) // 4), bool)
+    full = np.zeros(BLOCK * (-(-dims // BLOCK)), bool)
     full[: dims[0], : dims[1], : dims[2]] = (cells >= 0) & (occupancy[cells] != 0)
-    bx, by, bz = (n // 4 for n in full.shape)
-    near = full.reshape(bx, 4, by, 4, bz, 4).any(axis=(1, 3, 5))
-    away = np.zeros(near.shape, np.uint8)
-    for _ in range(MAX_AWAY):
-        away += ~near
-        near = _grown(near)
-    return away.ravel()
+    bx, by, bz = (n // BLOCK for n in full.shape)
+    blocks = full.reshape(bx, BLOCK, by, BLOCK, bz, BLOCK).any(axis=(1, 3, 5))
+    coarse = BLOCK * np.maximum(_steps_away(blocks, MAX_AWAY).astype(np.int64) - 1, 0) + 1
+    near = _steps_away(full, BLOCK)
+    for axis in range(3):
+        coarse = coarse.repeat(BLOCK, axis)
+    away = np.where(near < BLOCK, near, np.maximum(coarse, BLOCK)).astype(np.uint8)
+    return away[: dims[0], : dims[1], : dims[2]].ravel()
+
+
+def _steps_away(marked: np.ndarray, limit: int) -> UInt8[np.ndarray, "x y z"]:
+    """Chessboard distance to what is marked, at most `limit`."""
+    away = np.zeros(marked.shape, np.uint8)
+    for _ in range(limit):
+        away += ~marked
+        marked = _grown(marked)
+    return away
 
 
 def _grown(marked: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ def full_warp():
     return replace(
         warp,
         tables=tables._replace(
-            occupancy=np.full_like(tables.occupancy, 255), blocks=np.zeros_like(tables.blocks)
+            occupancy=np.full_like(tables.occupancy, 255), away=np.zeros_like(tables.away)
         ),
     )
 

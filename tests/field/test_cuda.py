@@ -49,7 +49,7 @@ def warps():
     warp = identity_warp(np.zeros(3), np.full(3, 0.62), cell_m=0.031)
     one = warp.tables._replace(
         occupancy=np.full_like(warp.tables.occupancy, 255),
-        blocks=np.zeros_like(warp.tables.blocks),
+        away=np.zeros_like(warp.tables.away),
     )
     moved = one.nodes + np.array([0.02, 0, 0, 0, 0, 0], np.float32)
     sheets = one.sheets.copy()

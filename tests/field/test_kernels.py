@@ -11,6 +11,7 @@ from ntop.field import twin
 from ntop.field.kernels.adjoint import train_rays
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tables import EMPTY_DENSITY
+from ntop.field.marching import EVERYWHERE
 from ntop.field.packing import packed_density, packed_sheets
 from tests.field.conftest import ball_grid, random_rays
 
@@ -33,8 +34,8 @@ def rendered(grid, warp, origins, directions, *, offsets, light, stop=0.0, step_
     render_rays(
         grid.tables(), warp.tables, packed_density(grid), packed_sheets(grid.tables(), warp.tables),
         light, np.zeros((1, 1, 1), np.uint8), np.zeros(3), 1.0, np.zeros(1, np.int64), origins,
-        directions, offsets, step_m, np.inf, stop, 0.0, True, colours, opacity, depth, parts,
-        evaluations,
+        directions, offsets, EVERYWHERE, step_m, np.inf, stop, 0.0, True, colours, opacity, depth,
+        parts, evaluations,
     )  # fmt: skip
     return colours, opacity, depth, evaluations
 

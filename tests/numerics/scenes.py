@@ -35,7 +35,7 @@ def opened(warp: PoseWarp) -> PoseWarp:
     """The same warp with every octant occupied."""
     tables = warp.tables
     full = tables._replace(
-        occupancy=np.full_like(tables.occupancy, 255), blocks=np.zeros_like(tables.blocks)
+        occupancy=np.full_like(tables.occupancy, 255), away=np.zeros_like(tables.away)
     )
     return PoseWarp(full, warp.origin_world, warp.cell_m)
 

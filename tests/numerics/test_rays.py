@@ -49,7 +49,7 @@ def full_grid(cell):
     warp = identity_warp(np.zeros(3), (CELLS - 0.5) * cell, cell_m=cell).tables
     assert tuple(warp.dims[0]) == tuple(CELLS)
     return warp._replace(
-        occupancy=np.full_like(warp.occupancy, 255), blocks=np.full_like(warp.blocks, 0)
+        occupancy=np.full_like(warp.occupancy, 255), away=np.full_like(warp.away, 0)
     )
 
 

@@ -35,7 +35,7 @@ MATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 def device(function: Callable) -> Callable:
     """A function that other kernels call."""
-    return numba.njit(cache=True, fastmath=MATH, error_model="numpy")(function)
+    return numba.njit(cache=True, fastmath=MATH, error_model="numpy", forceinline=True)(function)
 
 
 def kernel(function: Callable) -> Callable:

@@ -44,8 +44,8 @@ LARGEST = 2.0**20  # of what is added; a ray's slopes are of the order of 1
 @cuda.jit(cache=True)
 def march_rays(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
-    directions, offsets, step, piece_depth, stop, colour_floor, skipping, colours, opacity, depth,
-    parts, evaluations,
+    directions, offsets, spans, step, piece_depth, stop, colour_floor, skipping, colours, opacity,
+    depth, parts, evaluations,
 ):  # fmt: skip
     """As `march.render_rays`, but `evaluations` (2,) int64 are sums over all rays."""
     r = cuda.grid(1)
@@ -54,7 +54,8 @@ def march_rays(
     red, green, blue, opaque, median, part, voxels, samples = march_ray(
         grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
         poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
-        directions[r], offsets[r], step, piece_depth, stop, colour_floor, skipping,
+        directions[r], offsets[r], spans[r if spans.shape[0] > 1 else 0], step, piece_depth, stop,
+        colour_floor, skipping,
     )  # fmt: skip
     colours[r, 0], colours[r, 1], colours[r, 2] = red, green, blue
     opacity[r], depth[r], parts[r] = opaque, median, part

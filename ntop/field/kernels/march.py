@@ -17,8 +17,10 @@ import math
 import numba
 
 from ntop.field.kernels import device, kernel
+from ntop.field.kernels.exponentials import expm1_of_minus, logistic
 from ntop.field.kernels.packed import (
     brick_of,
+    is_full,
     raw_colour,
     raw_density,
     trilinear,
@@ -37,11 +39,9 @@ from ntop.field.kernels.pieces import (
 )
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
-    EMPTY_RAW,
     TINY_M,
     next_octant,
     shade,
-    sigmoid,
     start_ray,
 )
 
@@ -53,15 +53,26 @@ GAUSS_POINT = 1 / math.sqrt(3)  # of two, on [-1, 1]
 @device
 def sheet_place(sheets, cell, sheet, fx, fy, fz):
     """Canonical place (3, voxels) of a point of a cell on one of its sheets."""
-    return trilinear(sheets.corners[sheets.rows[cell, sheet]], 0, fx, fy, fz)
+    return trilinear(sheets.corners, sheets.rows[cell, sheet], 0, fx, fy, fz)
 
 
 @device
 def surface_normal(sheets, cell, sheet, fx, fy, fz):
     """World normal (3) at a point of a cell, of unit length."""
-    x, y, z = trilinear(sheets.corners[sheets.rows[cell, sheet]], 24, fx, fy, fz)
+    x, y, z = trilinear(sheets.corners, sheets.rows[cell, sheet], 24, fx, fy, fz)
     scale = 1 / math.sqrt(x * x + y * y + z * z + 1e-12)  # opposite normals may cancel
     return x * scale, y * scale, z * scale
+
+
+@device
+def lit_colour(sheets, light, cell, sheet, fx, fy, fz, albedo):
+    """A colour (3) under the light on the surface at a point of a cell."""
+    nx, ny, nz = surface_normal(sheets, cell, sheet, fx, fy, fz)
+    return (
+        albedo[0] * shade(light, 0, nx, ny, nz),
+        albedo[1] * shade(light, 1, nx, ny, nz),
+        albedo[2] * shade(light, 2, nx, ny, nz),
+    )
 
 
 @device
@@ -95,7 +106,7 @@ def part_at(grid, labels, labels_origin, inverse_spacing, x, y, z):
 @device
 def march_ray(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, pose, origin,
-    direction, offset, step, piece_depth, stop, colour_floor, skipping,
+    direction, offset, span, step, piece_depth, stop, colour_floor, skipping,
 ):  # fmt: skip
     """One ray; arguments as of `render_rays`.
 
@@ -103,6 +114,7 @@ def march_ray(
     up and of samples, densities computed in them.
     """
     ray, t, far = start_ray(warp, pose, origin, direction)
+    t, far = max(t, span[0]), min(far, span[1])
     red = green = blue = 0.0
     coloured = carried = 0.0
     thickness, transmittance = 0.0, 1.0
@@ -135,6 +147,10 @@ def march_ray(
         if two:
             end_b = sheet_place(sheets, cell, 1, gx, gy, gz)
             path_b = path_between(start_b, end_b, length)
+        # albedo times weight that waits for its light: normals vary slowly inside an octant
+        albedo = (0.0, 0.0, 0.0)
+        unlit = unlit_place = 0.0
+        unlit_sheet = 0
         s = 0.0
         while s < length and transmittance >= stop:
             # to the next face of a voxel
@@ -146,7 +162,7 @@ def march_ray(
             i, j, k = voxel_of(grid, x, y, z)
             slot = brick_of(density, i, j, k)
             voxels += 1
-            if slot == 0 and not two:
+            if not two and not is_full(density, slot, i, j, k):
                 s = border
                 continue
             c0, c1, c2, c3, c4, c5, c6, c7 = voxel_corners(density, slot, i, j, k)
@@ -176,20 +192,18 @@ def march_ray(
                 if light_ahead > piece_depth:
                     end = s + max(u / math.ceil(light_ahead / piece_depth), TINY_M)
                 half = 0.5 * (end - s)
-                mass = slope = 0.0
-                for side in (-1, 1):
-                    q = s + half * (1 + GAUSS_POINT * side)
-                    u = q - s
-                    raw = piece_0 + u * (piece_1 + u * (piece_2 + u * raw_3))
-                    if two:
-                        x, y, z = along(path_b, q)
-                        raw = max(raw, raw_density(grid, density, x, y, z))
-                    samples += 1
-                    if not raw <= EMPTY_RAW:  # NaN must stay visible
-                        found = rendered_density(raw)
-                        mass += found
-                        slope += found * side
-                if not mass <= 0:
+                u, q = half * (1 - GAUSS_POINT), half * (1 + GAUSS_POINT)
+                raw_u = piece_0 + u * (piece_1 + u * (piece_2 + u * raw_3))
+                raw_q = piece_0 + q * (piece_1 + q * (piece_2 + q * raw_3))
+                if two:
+                    x, y, z = along(path_b, s + u)
+                    raw_u = max(raw_u, raw_density(grid, density, x, y, z))
+                    x, y, z = along(path_b, s + q)
+                    raw_q = max(raw_q, raw_density(grid, density, x, y, z))
+                samples += 2
+                density_u, density_q = rendered_density(raw_u), rendered_density(raw_q)
+                mass, slope = density_u + density_q, density_q - density_u
+                if not mass <= 0:  # NaN must stay visible
                     tau = DENSITY_SCALE * mass * half
                     if thickness < MEDIAN_DEPTH <= thickness + tau:
                         q = s + (end - s) * (MEDIAN_DEPTH - thickness) / tau
@@ -200,7 +214,7 @@ def march_ray(
                     first = tau * (0.5 - 0.25 / GAUSS_POINT * slope / mass)
                     first = min(max(first, 0.0), tau)
                     second = tau - first
-                    lost_first, lost_second = math.expm1(-first), math.expm1(-second)
+                    lost_first, lost_second = expm1_of_minus(first), expm1_of_minus(second)
                     weight_first = transmittance * -lost_first
                     weight_second = (transmittance - weight_first) * -lost_second
                     weight = weight_first + weight_second
@@ -212,13 +226,23 @@ def march_ray(
                         ) / weight  # fmt: skip
                         sheet, x, y, z = denser_place(grid, density, path_a, path_b, two, q)
                         raw_red, raw_green, raw_blue = raw_colour(grid, x, y, z)
-                        nx, ny, nz = surface_normal(
-                            sheets, cell, sheet, fx + q * ray[3], fy + q * ray[4], fz + q * ray[5]
-                        )
+                        if unlit > 0 and (sheet != unlit_sheet or colour_floor == 0):
+                            place = unlit_place / unlit
+                            lit = lit_colour(
+                                sheets, light, cell, unlit_sheet, fx + place * ray[3],
+                                fy + place * ray[4], fz + place * ray[5], albedo,
+                            )  # fmt: skip
+                            red, green, blue = red + lit[0], green + lit[1], blue + lit[2]
+                            albedo, unlit, unlit_place = (0.0, 0.0, 0.0), 0.0, 0.0
                         weight += carried
-                        red += weight * sigmoid(raw_red) * shade(light, 0, nx, ny, nz)
-                        green += weight * sigmoid(raw_green) * shade(light, 1, nx, ny, nz)
-                        blue += weight * sigmoid(raw_blue) * shade(light, 2, nx, ny, nz)
+                        albedo = (
+                            albedo[0] + weight * logistic(raw_red),
+                            albedo[1] + weight * logistic(raw_green),
+                            albedo[2] + weight * logistic(raw_blue),
+                        )
+                        unlit_sheet = sheet
+                        unlit += weight
+                        unlit_place += weight * q
                         coloured += weight
                         carried = 0.0
                     else:
@@ -227,18 +251,25 @@ def march_ray(
                     transmittance *= (1 + lost_first) * (1 + lost_second)
                 s = end
             s = max(s, border)
+        if unlit > 0:
+            place = unlit_place / unlit
+            lit = lit_colour(
+                sheets, light, cell, unlit_sheet, fx + place * ray[3], fy + place * ray[4],
+                fz + place * ray[5], albedo,
+            )  # fmt: skip
+            red, green, blue = red + lit[0], green + lit[1], blue + lit[2]
         t = leave
     if coloured > 0:  # what is still carried takes the colour of what came before
         share = 1 + carried / coloured
         red, green, blue = red * share, green * share, blue * share
-    return red, green, blue, -math.expm1(-thickness), depth, part, voxels, samples
+    return red, green, blue, -expm1_of_minus(thickness), depth, part, voxels, samples
 
 
 @kernel
 def render_rays(
     grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing, poses, origins,
-    directions, offsets, step, piece_depth, stop, colour_floor, skipping, colours, opacity, depth,
-    parts, evaluations,
+    directions, offsets, spans, step, piece_depth, stop, colour_floor, skipping, colours, opacity,
+    depth, parts, evaluations,
 ):  # fmt: skip
     """Colour, opacity, median depth and part of each ray.
 
@@ -249,6 +280,8 @@ def render_rays(
         poses: (1 or rays,) which pose of `warp`.
         origins: (1 or rays, 3) relative to the warp grid's origin. directions: (rays, 3) unit.
         offsets: (rays,) of the lattice that bounds pieces, in steps. step: of it, metres.
+        spans: (1 or rays, 2) lengths (m) before the first and after the second of which the scene
+            is known to be empty.
         piece_depth: optical depth that a piece may have by its denser end, while all the light is
             there; the less light is left, the deeper.
         stop: transmittance below which a ray ends.
@@ -265,7 +298,8 @@ def render_rays(
             red, green, blue, opaque, median, part, looked_up, sampled = march_ray(
                 grid, warp, density, sheets, light, labels, labels_origin, inverse_spacing,
                 poses[r if poses.shape[0] > 1 else 0], origins[r if origins.shape[0] > 1 else 0],
-                directions[r], offsets[r], step, piece_depth, stop, colour_floor, skipping,
+                directions[r], offsets[r], spans[r if spans.shape[0] > 1 else 0], step,
+                piece_depth, stop, colour_floor, skipping,
             )  # fmt: skip
             colours[r, 0], colours[r, 1], colours[r, 2] = red, green, blue
             opacity[r], depth[r], parts[r] = opaque, median, part

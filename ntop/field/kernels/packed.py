@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ntop.field.kernels import device, kernel
-from ntop.field.kernels.tables import VOID_RAW
+from ntop.field.kernels.tables import EMPTY_RAW, VOID_RAW
 
 NODES = 5  # along a packed brick: its own four and the first of the next
 
@@ -22,11 +22,12 @@ class PackedDensity(NamedTuple):
     """Raw density of a canonical grid; row 0 is the void's.
 
     `slots[i >> 2, j >> 2, k >> 2]` is the row of the brick in which voxel (i, j, k) lies, and 0
-    where none of its voxels has a node above the threshold it was packed with.
+    where none of its voxels has a node above EMPTY_RAW. `full` says which of a brick's voxels do.
     """
 
     slots: Int[np.ndarray, "x y z"]
     raw: Float[np.ndarray, "slot 125"]
+    full: Bool[np.ndarray, "slot 64"]
 
 
 class PackedSheets(NamedTuple):
@@ -59,25 +60,18 @@ def row_of(grid, i, j, k):
 
 
 @device
-def trilinear(row, first, fx, fy, fz):
-    """The mean of 8 points at `row[first:first + 24]`, by corner number, at (fx, fy, fz)."""
+def trilinear(points, row, first, fx, fy, fz):
+    """The mean of 8 points at `points[row, first:first + 24]`, by corner number, at (fx, fy, fz).
+
+    Arrays are indexed, never sliced: a slice counts its references, atomically.
+    """
     ex, ey, ez = 1 - fx, 1 - fy, 1 - fz
-    w0, w1, w2, w3 = ex * ey * ez, ex * ey * fz, ex * fy * ez, ex * fy * fz
-    w4, w5, w6, w7 = fx * ey * ez, fx * ey * fz, fx * fy * ez, fx * fy * fz
-    x = (
-        w0 * row[first] + w1 * row[first + 3] + w2 * row[first + 6] + w3 * row[first + 9]
-        + w4 * row[first + 12] + w5 * row[first + 15] + w6 * row[first + 18] + w7 * row[first + 21]
-    )  # fmt: skip
-    first += 1
-    y = (
-        w0 * row[first] + w1 * row[first + 3] + w2 * row[first + 6] + w3 * row[first + 9]
-        + w4 * row[first + 12] + w5 * row[first + 15] + w6 * row[first + 18] + w7 * row[first + 21]
-    )  # fmt: skip
-    first += 1
-    z = (
-        w0 * row[first] + w1 * row[first + 3] + w2 * row[first + 6] + w3 * row[first + 9]
-        + w4 * row[first + 12] + w5 * row[first + 15] + w6 * row[first + 18] + w7 * row[first + 21]
-    )  # fmt: skip
+    x = y = z = fx * 0
+    for c in range(8):
+        w = (fx if c & 4 else ex) * (fy if c & 2 else ey) * (fz if c & 1 else ez)
+        x += w * points[row, first + 3 * c]
+        y += w * points[row, first + 3 * c + 1]
+        z += w * points[row, first + 3 * c + 2]
     return x, y, z
 
 
@@ -91,11 +85,10 @@ def brick_of(density, i, j, k):
 def voxel_corners(density, slot, i, j, k):
     """Raw density of the 8 nodes of a voxel, by corner number."""
     n = (NODES * (i & 3) + (j & 3)) * NODES + (k & 3)
-    raw = density.raw[slot]
+    raw, far = density.raw, n + NODES * NODES
     return (
-        raw[n], raw[n + 1], raw[n + NODES], raw[n + NODES + 1], raw[n + NODES * NODES],
-        raw[n + NODES * NODES + 1], raw[n + NODES * NODES + NODES],
-        raw[n + NODES * NODES + NODES + 1],
+        raw[slot, n], raw[slot, n + 1], raw[slot, n + NODES], raw[slot, n + NODES + 1],
+        raw[slot, far], raw[slot, far + 1], raw[slot, far + NODES], raw[slot, far + NODES + 1],
     )  # fmt: skip
 
 
@@ -130,12 +123,19 @@ def raw_colour(grid, x, y, z):
     return red, green, blue
 
 
+@device
+def is_full(density, slot, i, j, k):
+    """Whether a voxel of a packed brick has a node above EMPTY_RAW."""
+    return density.full[slot, ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)]
+
+
 @kernel
-def pack_bricks(grid, bricks, raw):
-    """Raw density of bricks and of the first nodes of the next ones.
+def pack_bricks(grid, bricks, raw, full):
+    """Raw density of bricks and of the first nodes of the next ones, and which voxels are full.
 
     Args:
         grid: Tables. bricks: (slots, 3) coordinates of the bricks. raw: (slots, 125) output.
+        full: (slots, 64) output.
     """
     shape = grid.bricks.shape
     for slot in numba.prange(bricks.shape[0]):
@@ -147,6 +147,13 @@ def pack_bricks(grid, bricks, raw):
                 raw[slot, n] = grid.values[row_of(grid, i, j, k), 0]
             else:
                 raw[slot, n] = VOID_RAW
+        for voxel in range(64):
+            i, j, k = voxel >> 4, (voxel >> 2) & 3, voxel & 3
+            first, found = (NODES * i + j) * NODES + k, False
+            for corner in range(8):
+                n = first + (NODES * (corner >> 2) + ((corner >> 1) & 1)) * NODES + (corner & 1)
+                found = found or not raw[slot, n] <= EMPTY_RAW  # NaN must stay visible
+            full[slot, voxel] = found
 
 
 @kernel

@@ -6,6 +6,7 @@ Lengths are metres along the ray, places are in voxels of the canonical grid.
 import math
 
 from ntop.field.kernels import device
+from ntop.field.kernels.exponentials import softplus_of
 from ntop.field.kernels.tables import EMPTY_DENSITY, EMPTY_RAW, HUGE, safe_inverse
 
 THIN = 1e-3  # optical depth below which a series replaces a difference that cancels
@@ -108,8 +109,5 @@ def mean_place(tau, lost):
 
 @device
 def rendered_density(raw):
-    """Density per DENSITY_SCALE of a raw value above EMPTY_RAW: softplus less what is empty.
-
-    So far from -infinity log(1 + e) loses nothing, and is cheaper than log1p.
-    """
-    return max(raw, 0.0) + math.log(1 + math.exp(-abs(raw))) - EMPTY_DENSITY
+    """Density per DENSITY_SCALE of a raw value: softplus less what is empty, and NaN for NaN."""
+    return 0.0 if raw <= EMPTY_RAW else softplus_of(raw) - EMPTY_DENSITY

@@ -8,9 +8,9 @@ Warp tables
     Per pose a grid of cells around the posed body. `cells` gives a cell's number or -1; a cell has
     one or two *sheets* of 8 nodes (two where two body parts are near each other), and a node holds
     [canonical position (metres), world normal of the nearest surface]. Bit c of `occupancy` says
-    whether octant c of the cell may hold density; `blocks` says of 4 x 4 x 4 cells how many blocks
-    away the nearest block with such an octant is. Corner and octant number c counts x in bit 2, y
-    in bit 1, z in bit 0.
+    whether octant c of the cell may hold density; `away` says of all cells, as of `cells`, how many
+    cells away the nearest one with such an octant is at least: 0 where it is that cell itself.
+    Corner and octant number c counts x in bit 2, y in bit 1, z in bit 0.
 """
 
 import math
@@ -47,13 +47,12 @@ class WarpTables(NamedTuple):
 
     dims: Int[np.ndarray, "pose 3"]
     cell_offset: Int[np.ndarray, " pose"]
-    block_offset: Int[np.ndarray, " pose"]
     inverse_cell: float
     cells: Int[np.ndarray, " any"]
     sheets: Int[np.ndarray, "cell 2 8"]
     nodes: Float[np.ndarray, "node 6"]
     occupancy: UInt8[np.ndarray, " cell"]
-    blocks: UInt8[np.ndarray, " any"]
+    away: UInt8[np.ndarray, " any"]
 
 
 @device
@@ -213,7 +212,6 @@ def next_octant(warp, pose, ray, t, far, skipping):
     is walked through octant by octant too, and those octants are returned as cell -2.
     """
     nx, ny, nz = warp.dims[pose, 0], warp.dims[pose, 1], warp.dims[pose, 2]
-    mx, my = (ny + 3) >> 2, (nz + 3) >> 2
     while t < far:
         px, py, pz = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
         i, j, k = int(px), int(py), int(pz)
@@ -226,27 +224,24 @@ def next_octant(warp, pose, ray, t, far, skipping):
             continue
         found = -1
         fx, fy, fz = px - i, py - j, pz - k
-        away = warp.blocks[warp.block_offset[pose] + ((i >> 2) * mx + (j >> 2)) * my + (k >> 2)]
+        n = warp.cell_offset[pose] + (i * ny + j) * nz + k
+        away = warp.away[n]
         if away > 0 and skipping:
-            # no block is occupied that is less than `away` blocks from this one
-            reach = 4.0 * (away - 1)
-            low_x, low_y, low_z = (i & ~3) - reach, (j & ~3) - reach, (k & ~3) - reach
-            size = 4.0 + 2 * reach
+            # no cell is occupied that is less than `away` cells from this one
+            reach = 1.0 * (away - 1)
+            low_x, low_y, low_z = i - reach, j - reach, k - reach
+            size = 1.0 + 2 * reach
         else:
-            cell = warp.cells[warp.cell_offset[pose] + (i * ny + j) * nz + k]
-            if skipping and (cell < 0 or warp.occupancy[cell] == 0):
-                low_x, low_y, low_z = 1.0 * i, 1.0 * j, 1.0 * k
-                size = 1.0
-            else:
-                high_x = fx > 0.5 or (fx == 0.5 and not ray[3] < 0)
-                high_y = fy > 0.5 or (fy == 0.5 and not ray[4] < 0)
-                high_z = fz > 0.5 or (fz == 0.5 and not ray[5] < 0)
-                low_x, low_y, low_z = i + 0.5 * high_x, j + 0.5 * high_y, k + 0.5 * high_z
-                size = 0.5
-                if cell < 0:
-                    found = -2
-                elif (warp.occupancy[cell] >> (4 * high_x + 2 * high_y + 1 * high_z)) & 1:
-                    found = cell
+            cell = warp.cells[n]
+            high_x = fx > 0.5 or (fx == 0.5 and not ray[3] < 0)
+            high_y = fy > 0.5 or (fy == 0.5 and not ray[4] < 0)
+            high_z = fz > 0.5 or (fz == 0.5 and not ray[5] < 0)
+            low_x, low_y, low_z = i + 0.5 * high_x, j + 0.5 * high_y, k + 0.5 * high_z
+            size = 0.5
+            if cell < 0:
+                found = -1 if skipping else -2
+            elif (warp.occupancy[cell] >> (4 * high_x + 2 * high_y + 1 * high_z)) & 1:
+                found = cell
         leave = min(
             exit_length(ray[0], ray[6], low_x, size),
             min(exit_length(ray[1], ray[7], low_y, size), exit_length(ray[2], ray[8], low_z, size)),

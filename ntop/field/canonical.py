@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from ntop.body.model import BodyModel, part_labels
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.field.kernels.canonical import mark_dense, resample, signed_distances
-from ntop.field.kernels.posing import nearest_vertices
+from ntop.field.kernels.nearest import nearest_vertices
 from ntop.field.kernels.tables import VOID_RAW, GridTables
 
 LEG_SPREAD_RAD = math.radians(20)

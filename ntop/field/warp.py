@@ -15,12 +15,9 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
 from ntop.field.canonical import CanonicalBody, Occupancy, vertex_normals
+from ntop.field.kernels.nearest import nearest_vertices
 from ntop.field.kernels.occupancy import octant_occupancy
-from ntop.field.kernels.posing import (
-    nearest_vertices,
-    node_records,
-    vertex_maps,
-)
+from ntop.field.kernels.posing import node_records, vertex_maps
 from ntop.field.kernels.sheets import cell_sheets
 from ntop.field.kernels.tables import WarpTables
 

@@ -22,14 +22,15 @@ def signed_distances(
     """
     for n in numba.prange(nodes.shape[0]):
         node = nodes[n]
-        p = np.empty(3, np.float64)
-        p[0] = (node // (dims[1] * dims[2])) * spacing
-        p[1] = (node // dims[2] % dims[1]) * spacing
-        p[2] = (node % dims[2]) * spacing
+        p = (
+            (node // (dims[1] * dims[2])) * spacing,
+            (node // dims[2] % dims[1]) * spacing,
+            (node % dims[2]) * spacing,
+        )
         face, squared, a, b, c = closest_on_surface(
             p, nearest[node], vertices, faces, ring_offsets, ring_faces
         )
-        corners, weights = faces[face], (a, b, c)
+        corners, weights = (faces[face, 0], faces[face, 1], faces[face, 2]), (a, b, c)
         side = 0.0
         for i in range(3):
             point = mean_of(weights, corners, vertices, i)

@@ -3,7 +3,6 @@
 Twin of the geometry: `tests/field/test_warp.py` compares with brute force.
 """
 
-
 import numba
 import numpy as np
 

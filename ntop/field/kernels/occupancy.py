@@ -11,17 +11,19 @@ CHUNK = 512  # cells that share their scratch memory: allocating it costs as muc
 
 
 @device
-def marked_in(sums, origin, inverse_spacing, low, high):
-    """How many cells of a grid (origin in metres) the box low..high touches, and how many marked.
+def marked_in(sums, origin, inverse_spacing, lows, highs, i, j, k):
+    """How many cells of a grid (origin in metres) a box touches, and how many marked ones.
+
+    The box is `lows[:, i, j, k]`..`highs[:, i, j, k]`: a slice would cost more than the answer.
 
     `sums[i, j, k]` counts the marked cells below (i, j, k): eight numbers answer for any box.
     """
-    i0 = int(math.floor((low[0] - origin[0]) * inverse_spacing))
-    j0 = int(math.floor((low[1] - origin[1]) * inverse_spacing))
-    k0 = int(math.floor((low[2] - origin[2]) * inverse_spacing))
-    i1 = int(math.floor((high[0] - origin[0]) * inverse_spacing)) + 1
-    j1 = int(math.floor((high[1] - origin[1]) * inverse_spacing)) + 1
-    k1 = int(math.floor((high[2] - origin[2]) * inverse_spacing)) + 1
+    i0 = int(math.floor((lows[0, i, j, k] - origin[0]) * inverse_spacing))
+    j0 = int(math.floor((lows[1, i, j, k] - origin[1]) * inverse_spacing))
+    k0 = int(math.floor((lows[2, i, j, k] - origin[2]) * inverse_spacing))
+    i1 = int(math.floor((highs[0, i, j, k] - origin[0]) * inverse_spacing)) + 1
+    j1 = int(math.floor((highs[1, i, j, k] - origin[1]) * inverse_spacing)) + 1
+    k1 = int(math.floor((highs[2, i, j, k] - origin[2]) * inverse_spacing)) + 1
     touched = (i1 - i0) * (j1 - j0) * (k1 - k0)
     i0, j0, k0 = max(i0, 0), max(j0, 0), max(k0, 0)
     i1 = min(i1, sums.shape[0] - 1)
@@ -35,17 +37,21 @@ def marked_in(sums, origin, inverse_spacing, low, high):
 
 
 @device
-def cell_corners(warp, cell, sheet, points, low, high):
-    """Canonical images of a cell's corners, in the corners of `points` (3, 3, 3, 3), and bounds."""
+def cell_corners(warp, cell, sheet, points, lows, highs):
+    """Canonical images of a cell's corners, in the corners of `points` (3, 3, 3, 3).
+
+    Their bounds go to [:, 2, 2, 2] of `lows` and `highs` (3, 3, 3, 3).
+    """
     for axis in range(3):
-        low[axis], high[axis] = np.inf, -np.inf
+        lows[axis, 2, 2, 2], highs[axis, 2, 2, 2] = np.inf, -np.inf
     for corner in range(8):
         node = warp.sheets[cell, sheet, corner]
         i, j, k = 2 * (corner >> 2), 2 * ((corner >> 1) & 1), 2 * (corner & 1)
         for axis in range(3):
             value = warp.nodes[node, axis]
             points[axis, i, j, k] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+            lows[axis, 2, 2, 2] = min(lows[axis, 2, 2, 2], value)
+            highs[axis, 2, 2, 2] = max(highs[axis, 2, 2, 2], value)
 
 
 @device
@@ -61,34 +67,33 @@ def octant_bounds(points, extent, sums, lows, highs):
         lows, highs: (3, 3, 3, 3) output, octants in the first two places of each direction.
     """
     for axis in range(3):
-        values, least, most = points[axis], lows[axis], highs[axis]
         for j in range(0, 3, 2):
             for k in range(0, 3, 2):
-                values[1, j, k] = 0.5 * (values[0, j, k] + values[2, j, k])
+                points[axis, 1, j, k] = 0.5 * (points[axis, 0, j, k] + points[axis, 2, j, k])
         for i in range(3):
             for k in range(0, 3, 2):
-                values[i, 1, k] = 0.5 * (values[i, 0, k] + values[i, 2, k])
+                points[axis, i, 1, k] = 0.5 * (points[axis, i, 0, k] + points[axis, i, 2, k])
             for j in range(3):
-                values[i, j, 1] = 0.5 * (values[i, j, 0] + values[i, j, 2])
+                points[axis, i, j, 1] = 0.5 * (points[axis, i, j, 0] + points[axis, i, j, 2])
         for i in range(3):
             for j in range(3):
                 for k in range(2):
-                    one, other = values[i, j, k], values[i, j, k + 1]
-                    least[i, j, k], most[i, j, k] = min(one, other), max(one, other)
+                    one, other = points[axis, i, j, k], points[axis, i, j, k + 1]
+                    lows[axis, i, j, k], highs[axis, i, j, k] = min(one, other), max(one, other)
                     sums[i, j, k] = one + other
             for j in range(2):
                 for k in range(2):
-                    least[i, j, k] = min(least[i, j, k], least[i, j + 1, k])
-                    most[i, j, k] = max(most[i, j, k], most[i, j + 1, k])
+                    lows[axis, i, j, k] = min(lows[axis, i, j, k], lows[axis, i, j + 1, k])
+                    highs[axis, i, j, k] = max(highs[axis, i, j, k], highs[axis, i, j + 1, k])
                     sums[i, j, k] += sums[i, j + 1, k]
         for i in range(2):
             for j in range(2):
                 for k in range(2):
                     mean = (sums[i, j, k] + sums[i + 1, j, k]) / 8
-                    low = min(least[i, j, k], least[i + 1, j, k])
-                    high = max(most[i, j, k], most[i + 1, j, k])
-                    least[i, j, k] = mean + extent * (low - mean)
-                    most[i, j, k] = mean + extent * (high - mean)
+                    low = min(lows[axis, i, j, k], lows[axis, i + 1, j, k])
+                    high = max(highs[axis, i, j, k], highs[axis, i + 1, j, k])
+                    lows[axis, i, j, k] = mean + extent * (low - mean)
+                    highs[axis, i, j, k] = mean + extent * (high - mean)
 
 
 @kernel
@@ -106,14 +111,13 @@ def octant_occupancy(warp, sums, origin, inverse_spacing, extent, occupancy):
     for chunk in numba.prange((cells + CHUNK - 1) // CHUNK):
         points, partial = np.empty((3, 3, 3, 3)), np.empty((3, 3, 3))
         lows, highs = np.empty((3, 3, 3, 3)), np.empty((3, 3, 3, 3))
-        low, high = np.empty(3), np.empty(3)
         for cell in range(chunk * CHUNK, min(cells, (chunk + 1) * CHUNK)):
             bits = 0
             for sheet in range(2):
                 if warp.sheets[cell, sheet, 0] < 0:
                     continue
-                cell_corners(warp, cell, sheet, points, low, high)
-                touched, marked = marked_in(sums, origin, inverse_spacing, low, high)
+                cell_corners(warp, cell, sheet, points, lows, highs)
+                touched, marked = marked_in(sums, origin, inverse_spacing, lows, highs, 2, 2, 2)
                 if marked == 0:
                     continue
                 if marked == touched:  # so are those that its octants touch
@@ -122,9 +126,7 @@ def octant_occupancy(warp, sums, origin, inverse_spacing, extent, occupancy):
                 octant_bounds(points, extent, partial, lows, highs)
                 for octant in range(8):
                     i, j, k = octant >> 2, (octant >> 1) & 1, octant & 1
-                    _, marked = marked_in(
-                        sums, origin, inverse_spacing, lows[:, i, j, k], highs[:, i, j, k]
-                    )
+                    _, marked = marked_in(sums, origin, inverse_spacing, lows, highs, i, j, k)
                     if marked > 0:
                         bits |= 1 << octant
             occupancy[cell] = bits

@@ -16,7 +16,6 @@ MAIN_SHARE = 0.02  # of the main bone: it decides directions that blending has c
 LEAST_RISE = 0.5  # of a point's distance from the skin: so far it stays above it at least
 TINY_VOLUME = 1e-6
 TINY_LENGTH = 1e-12
-CHUNK = 256  # nodes that share their scratch memory: allocating it costs as much as half of one
 
 
 @device
@@ -85,14 +84,18 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
 
 
 @device
-def closest_weights(p, a, b, c):
-    """Barycentric weights of the point of triangle abc closest to p, and the squared distance.
+def closest_weights(p, vertices, i, j, k):
+    """Barycentric weights of the point of a triangle closest to p, and the squared distance.
 
     Regions of the triangle as in Ericson, Real-Time Collision Detection, 5.1.5.
+
+    Args:
+        p: Three coordinates. vertices: (V, 3). i, j, k: the triangle's.
     """
-    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    ap0, ap1, ap2 = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    a0, a1, a2 = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+    ab0, ab1, ab2 = vertices[j, 0] - a0, vertices[j, 1] - a1, vertices[j, 2] - a2
+    ac0, ac1, ac2 = vertices[k, 0] - a0, vertices[k, 1] - a1, vertices[k, 2] - a2
+    ap0, ap1, ap2 = p[0] - a0, p[1] - a1, p[2] - a2
     d1 = ab0 * ap0 + ab1 * ap1 + ab2 * ap2
     d2 = ac0 * ap0 + ac1 * ap1 + ac2 * ap2
     aa = ab0 * ab0 + ab1 * ab1 + ab2 * ab2
@@ -124,7 +127,7 @@ def closest_weights(p, a, b, c):
 
 @device
 def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces):
-    """Face around vertex v whose surface is closest to p.
+    """Face around vertex v whose surface is closest to p, three coordinates.
 
     Returns the face (-1 where no face has the vertex), the squared distance and the three weights.
     """
@@ -132,9 +135,7 @@ def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces):
     a = b = c = 0.0
     for r in range(ring_offsets[v], ring_offsets[v + 1]):
         f = ring_faces[r]
-        wa, wb, wc, d = closest_weights(
-            p, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        )
+        wa, wb, wc, d = closest_weights(p, vertices, faces[f, 0], faces[f, 1], faces[f, 2])
         if d < best:
             best, chosen, a, b, c = d, f, wa, wb, wc
     return chosen, best, a, b, c
@@ -175,7 +176,7 @@ def way_back(
     directions, and some would lead into the leg again.
 
     Args:
-        p: (3,) metres, as `posed`. v: vertex nearest to p (or nearest of one part).
+        p: three coordinates, metres, as `posed`. v: vertex nearest to p (or nearest of one part).
         posed, canonical, normals, canonical_normals: (V, 3). maps: (V, 3, 4) posed -> canonical.
         record: (6,) output.
 
@@ -194,15 +195,15 @@ def way_back(
             break
         v, last = heaviest, squared
         face, squared, a, b, c = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces)
-    corners, weights = faces[face], (a, b, c)
+    corners, weights = (faces[face, 0], faces[face, 1], faces[face, 2]), (a, b, c)
     x = p[0] - mean_of(weights, corners, posed, 0)
     y = p[1] - mean_of(weights, corners, posed, 1)
     z = p[2] - mean_of(weights, corners, posed, 2)
     for i in range(3):
         offset = 0.0
         for corner in range(3):
-            m = maps[corners[corner], i]
-            offset += weights[corner] * (m[0] * x + m[1] * y + m[2] * z)
+            u = corners[corner]
+            offset += weights[corner] * (maps[u, i, 0] * x + maps[u, i, 1] * y + maps[u, i, 2] * z)
         record[i] = mean_of(weights, corners, canonical, i) + offset
         record[3 + i] = mean_of(weights, corners, normals, i)
     height = x * record[3] + y * record[4] + z * record[5]
@@ -233,16 +234,15 @@ def node_records(
         distance: (2, nodes) squared metres; sharpened from vertex to surface distance.
         records: (any, 6) output. outside: (any,) output, whether the node is outside that surface.
     """
-    count = node_ids.shape[0]
-    for chunk in numba.prange((count + CHUNK - 1) // CHUNK):
-        p = np.empty(3, np.float64)
-        for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            node, candidate = node_ids[n, 0], node_ids[n, 1]
-            p[0] = (node // (dims[1] * dims[2])) * cell
-            p[1] = (node // dims[2] % dims[1]) * cell
-            p[2] = (node % dims[2]) * cell
-            distance[candidate, node], height = way_back(
-                p, nearest[candidate, node], posed, canonical, faces, ring_offsets, ring_faces,
-                maps, normals, canonical_normals, records[n],
-            )  # fmt: skip
-            outside[n] = height > 0
+    for n in numba.prange(node_ids.shape[0]):
+        node, candidate = node_ids[n, 0], node_ids[n, 1]
+        p = (
+            (node // (dims[1] * dims[2])) * cell,
+            (node // dims[2] % dims[1]) * cell,
+            (node % dims[2]) * cell,
+        )
+        distance[candidate, node], height = way_back(
+            p, nearest[candidate, node], posed, canonical, faces, ring_offsets, ring_faces, maps,
+            normals, canonical_normals, records[n],
+        )  # fmt: skip
+        outside[n] = height > 0

@@ -19,11 +19,12 @@ def apply_map(m, x, y, z, out):
 
 
 @device
-def squared_gaps(m, first, cell, records, chosen, gaps):
-    """Squared distance of each record of a cell from where an affine map (3, 4) puts its corner.
+def squared_gaps(maps, v, first, cell, records, chosen, gaps):
+    """Squared distance of each record of a cell from where a vertex's map puts its corner.
 
     Args:
-        first: (3,) node numbers along each axis of the cell's corner 0. cell: node spacing (m).
+        maps: (V, 3, 4). v: the vertex. first: (3,) node numbers of the cell's corner 0. cell: node
+            spacing (m).
         chosen: (8, 2) record of each corner and candidate, or -1. gaps: (8, 2) output.
     """
     x, y, z = first[0] * cell, first[1] * cell, first[2] * cell
@@ -31,8 +32,9 @@ def squared_gaps(m, first, cell, records, chosen, gaps):
         for candidate in range(2):
             gaps[corner, candidate] = 0.0
     for axis in range(3):
-        along_x, along_y, along_z = m[axis, 0] * cell, m[axis, 1] * cell, m[axis, 2] * cell
-        start = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3]
+        mx, my, mz = maps[v, axis, 0], maps[v, axis, 1], maps[v, axis, 2]
+        along_x, along_y, along_z = mx * cell, my * cell, mz * cell
+        start = mx * x + my * y + mz * z + maps[v, axis, 3]
         for corner in range(8):
             place = start
             if corner & 4:
@@ -108,7 +110,7 @@ def cell_sheets(
                 if vertex < 0:
                     sheets[number, sheet] = -1
                     continue
-                squared_gaps(maps[vertex], first, cell, records, chosen, gaps)
+                squared_gaps(maps, vertex, first, cell, records, chosen, gaps)
                 for corner in range(8):
                     best, record = near, -1
                     for candidate in range(2):

@@ -70,16 +70,19 @@ def pose_warp(
         vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m, radius, APART_M,
         2, nearest, distance,
     )  # fmt: skip
-    candidates, nodes = np.nonzero(nearest >= 0)
-    records = np.empty((len(nodes), 6), np.float32)
-    outside = np.empty(len(nodes), np.bool_)
+    found = np.flatnonzero(nearest >= 0)
+    ids = np.empty((len(found), 2), np.int32)
+    ids[:, 1] = found >= count
+    ids[:, 0] = found - count * ids[:, 1]
+    records = np.empty((len(ids), 6), np.float32)
+    outside = np.empty(len(ids), np.bool_)
     node_records(
-        np.stack([nodes, candidates], 1), vertices, body.vertices, body.faces, body.ring_offsets,
+        ids, vertices, body.vertices, body.faces, body.ring_offsets,
         body.ring_faces, maps, normals, body.normals, dims, cell_m, nearest, distance, records,
         outside,
     )  # fmt: skip
     record_of = np.full((2, count), -1, np.int32)
-    record_of[candidates, nodes] = np.arange(len(nodes))
+    record_of.ravel()[found] = np.arange(len(found), dtype=np.int32)
 
     cells = _cells_near(distance[0].reshape(dims), reach_m, cell_m)
     cell_ids = np.flatnonzero(cells >= 0)
@@ -91,16 +94,18 @@ def pose_warp(
         base, dims, cell_m, nearest, distance, record_of, records, outside, maps, normals,
         body.vertices, body.normals, reach_m, AGREE_M, sheets, extra_count, extra,
     )  # fmt: skip
-    first_extra = len(records) + np.concatenate([[0], np.cumsum(extra_count)[:-1]])
-    extras = extra[np.arange(EXTRA_PER_CELL) < extra_count[:, None]]
-    sheets = np.where(sheets <= -2, first_extra[:, None, None] - 2 - sheets, sheets)
+    extended = np.flatnonzero(extra_count)  # few cells; the others' sheets are records alone
+    counts, own = extra_count[extended], sheets[extended]
+    first = len(records) + np.cumsum(counts, dtype=np.int32) - counts
+    sheets[extended] = np.where(own <= -2, first[:, None, None] - 2 - own, own)
+    extras = extra[extended][np.arange(EXTRA_PER_CELL) < counts[:, None]]
     tables = WarpTables(
         dims=(dims - 1)[None],
         cell_offset=np.zeros(1, np.int64),
         block_offset=np.zeros(1, np.int64),
         inverse_cell=1 / cell_m,
         cells=cells.ravel(),
-        sheets=sheets.astype(np.int32),
+        sheets=sheets,
         nodes=np.concatenate([records, extras]),
         occupancy=np.zeros(len(base), np.uint8),
         blocks=np.zeros(int(np.prod((dims + 2) // 4)), np.uint8),

@@ -121,8 +121,9 @@ def occupied(tables: WarpTables, occupancy: Occupancy, *, extent: float = 0.0) -
     """
     found = np.empty_like(tables.occupancy)
     octant_occupancy(
-        tables, occupancy.sums, occupancy.origin, 1 / occupancy.spacing_m, extent, found
-    )
+        tables, occupancy.sums, occupancy.coarse_sums, occupancy.origin, 1 / occupancy.spacing_m,
+        extent, found,
+    )  # fmt: skip
     return with_octants(tables, found)
 
 

@@ -8,32 +8,33 @@ import numpy as np
 from ntop.field.kernels import device, kernel
 
 CHUNK = 512  # cells that share their scratch memory: allocating it costs as much as a plain cell
+COARSE = 4  # canonical cells along a block, in the table that is asked first
 
 
 @device
-def marked_in(sums, origin, inverse_spacing, lows, highs, i, j, k):
-    """How many cells of a grid (origin in metres) a box touches, and how many marked ones.
+def touched_range(lows, highs, origin, inverse_spacing, axis, i, j, k):
+    """Cells of a grid (origin in metres) that the box (i, j, k) touches along an axis: [a, b)."""
+    return (
+        int(math.floor((lows[axis, i, j, k] - origin[axis]) * inverse_spacing)),
+        int(math.floor((highs[axis, i, j, k] - origin[axis]) * inverse_spacing)) + 1,
+    )
 
-    The box is `lows[:, i, j, k]`..`highs[:, i, j, k]`: a slice would cost more than the answer.
 
-    `sums[i, j, k]` counts the marked cells below (i, j, k): eight numbers answer for any box.
+@device
+def marked_in(sums, i0, i1, j0, j1, k0, k1):
+    """How many cells of a range are marked; it may go beyond the grid.
+
+    `sums[i, j, k]` counts the marked cells below (i, j, k): eight numbers answer for any range.
     """
-    i0 = int(math.floor((lows[0, i, j, k] - origin[0]) * inverse_spacing))
-    j0 = int(math.floor((lows[1, i, j, k] - origin[1]) * inverse_spacing))
-    k0 = int(math.floor((lows[2, i, j, k] - origin[2]) * inverse_spacing))
-    i1 = int(math.floor((highs[0, i, j, k] - origin[0]) * inverse_spacing)) + 1
-    j1 = int(math.floor((highs[1, i, j, k] - origin[1]) * inverse_spacing)) + 1
-    k1 = int(math.floor((highs[2, i, j, k] - origin[2]) * inverse_spacing)) + 1
-    touched = (i1 - i0) * (j1 - j0) * (k1 - k0)
     i0, j0, k0 = max(i0, 0), max(j0, 0), max(k0, 0)
     i1 = min(i1, sums.shape[0] - 1)
     j1 = min(j1, sums.shape[1] - 1)
     k1 = min(k1, sums.shape[2] - 1)
     if i0 >= i1 or j0 >= j1 or k0 >= k1:
-        return touched, 0
+        return 0
     upper = sums[i1, j1, k1] - sums[i1, j0, k1] - sums[i1, j1, k0] + sums[i1, j0, k0]
     lower = sums[i0, j1, k1] - sums[i0, j0, k1] - sums[i0, j1, k0] + sums[i0, j0, k0]
-    return touched, upper - lower
+    return upper - lower
 
 
 @device
@@ -97,12 +98,13 @@ def octant_bounds(points, extent, sums, lows, highs):
 
 
 @kernel
-def octant_occupancy(warp, sums, origin, inverse_spacing, extent, occupancy):
+def octant_occupancy(warp, sums, coarse_sums, origin, inverse_spacing, extent, occupancy):
     """Bit c of a cell: does the canonical occupancy allow density in octant c?
 
     Args:
-        warp: Tables. sums: Counts of marked canonical cells, see `marked_in`. origin,
-            inverse_spacing: Of these cells (metres, 1/m).
+        warp: Tables. sums: Counts of marked canonical cells, see `marked_in`. coarse_sums: Those
+            at the corners of blocks of `COARSE` cells. origin, inverse_spacing: Of the cells
+            (metres, 1/m).
         extent: how much of each octant is looked at: 1 is all of it, so that no density is missed;
             0 is its centre alone, for an occupancy dilated by the half diagonal of an octant.
         occupancy: (cells,) uint8 output.
@@ -117,16 +119,27 @@ def octant_occupancy(warp, sums, origin, inverse_spacing, extent, occupancy):
                 if warp.sheets[cell, sheet, 0] < 0:
                     continue
                 cell_corners(warp, cell, sheet, points, lows, highs)
-                touched, marked = marked_in(sums, origin, inverse_spacing, lows, highs, 2, 2, 2)
+                i0, i1 = touched_range(lows, highs, origin, inverse_spacing, 0, 2, 2, 2)
+                j0, j1 = touched_range(lows, highs, origin, inverse_spacing, 1, 2, 2, 2)
+                k0, k1 = touched_range(lows, highs, origin, inverse_spacing, 2, 2, 2, 2)
+                near = marked_in(
+                    coarse_sums, i0 // COARSE, (i1 + COARSE - 1) // COARSE, j0 // COARSE,
+                    (j1 + COARSE - 1) // COARSE, k0 // COARSE, (k1 + COARSE - 1) // COARSE,
+                )  # fmt: skip
+                if near == 0:
+                    continue
+                marked = marked_in(sums, i0, i1, j0, j1, k0, k1)
                 if marked == 0:
                     continue
-                if marked == touched:  # so are those that its octants touch
+                if marked == (i1 - i0) * (j1 - j0) * (k1 - k0):  # so are those its octants touch
                     bits = 255
                     break
                 octant_bounds(points, extent, partial, lows, highs)
                 for octant in range(8):
                     i, j, k = octant >> 2, (octant >> 1) & 1, octant & 1
-                    _, marked = marked_in(sums, origin, inverse_spacing, lows, highs, i, j, k)
-                    if marked > 0:
+                    i0, i1 = touched_range(lows, highs, origin, inverse_spacing, 0, i, j, k)
+                    j0, j1 = touched_range(lows, highs, origin, inverse_spacing, 1, i, j, k)
+                    k0, k1 = touched_range(lows, highs, origin, inverse_spacing, 2, i, j, k)
+                    if marked_in(sums, i0, i1, j0, j1, k0, k1) > 0:
                         bits |= 1 << octant
             occupancy[cell] = bits

@@ -15,7 +15,8 @@ from jaxtyping import Float, Int, UInt8
 from ntop.body.model import BodyModel, part_labels
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.field.kernels.canonical import mark_dense, resample, signed_distances
-from ntop.field.kernels.posing import nearest_vertices
+from ntop.field.kernels.nearest import nearest_vertices
+from ntop.field.kernels.occupancy import COARSE
 from ntop.field.kernels.tables import VOID_RAW, GridTables
 
 LEG_SPREAD_RAD = math.radians(20)
@@ -72,6 +73,12 @@ class Occupancy:
         for axis in range(3):
             np.cumsum(sums, axis=axis, out=sums)
         return sums
+
+    @functools.cached_property
+    def coarse_sums(self) -> Int[np.ndarray, "x2 y2 z2"]:
+        """Those of `sums` between blocks of `COARSE` cells: small enough to stay in the cache."""
+        ends = [np.minimum(np.arange(0, n + COARSE, COARSE), n) for n in self.cells.shape]
+        return self.sums[np.ix_(*ends)]
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,9 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import DataError
 from ntop.field.canonical import CanonicalBody, Occupancy, vertex_normals
+from ntop.field.kernels.nearest import nearest_vertices
 from ntop.field.kernels.occupancy import octant_occupancy
-from ntop.field.kernels.posing import (
-    nearest_vertices,
-    node_records,
-    vertex_maps,
-)
+from ntop.field.kernels.posing import node_records, vertex_maps
 from ntop.field.kernels.sheets import cell_sheets
 from ntop.field.kernels.tables import WarpTables
 from ntop.field.kernels.tiles import outer_cells
@@ -88,16 +85,19 @@ def pose_warp(
         vertices.astype(np.float32), maps.astype(np.float32), dims, cell_m, radius, APART_M,
         2, nearest, distance,
     )  # fmt: skip
-    candidates, nodes = np.nonzero(nearest >= 0)
-    records = np.empty((len(nodes), 6), np.float32)
-    outside = np.empty(len(nodes), np.bool_)
+    found = np.flatnonzero(nearest >= 0)
+    ids = np.empty((len(found), 2), np.int32)
+    ids[:, 1] = found >= count
+    ids[:, 0] = found - count * ids[:, 1]
+    records = np.empty((len(ids), 6), np.float32)
+    outside = np.empty(len(ids), np.bool_)
     node_records(
-        np.stack([nodes, candidates], 1), vertices, body.vertices, body.faces, body.ring_offsets,
+        ids, vertices, body.vertices, body.faces, body.ring_offsets,
         body.ring_faces, maps, normals, body.normals, dims, cell_m, nearest, distance, records,
         outside,
     )  # fmt: skip
     record_of = np.full((2, count), -1, np.int32)
-    record_of[candidates, nodes] = np.arange(len(nodes))
+    record_of.ravel()[found] = np.arange(len(found), dtype=np.int32)
 
     cells = _cells_near(distance[0].reshape(dims), reach_m, cell_m)
     cell_ids = np.flatnonzero(cells >= 0)
@@ -109,15 +109,17 @@ def pose_warp(
         base, dims, cell_m, nearest, distance, record_of, records, outside, maps, normals,
         body.vertices, body.normals, reach_m, AGREE_M, sheets, extra_count, extra,
     )  # fmt: skip
-    first_extra = len(records) + np.concatenate([[0], np.cumsum(extra_count)[:-1]])
-    extras = extra[np.arange(EXTRA_PER_CELL) < extra_count[:, None]]
-    sheets = np.where(sheets <= -2, first_extra[:, None, None] - 2 - sheets, sheets)
+    extended = np.flatnonzero(extra_count)  # few cells; the others' sheets are records alone
+    counts, own = extra_count[extended], sheets[extended]
+    first = len(records) + np.cumsum(counts, dtype=np.int32) - counts
+    sheets[extended] = np.where(own <= -2, first[:, None, None] - 2 - own, own)
+    extras = extra[extended][np.arange(EXTRA_PER_CELL) < counts[:, None]]
     tables = WarpTables(
         dims=(dims - 1)[None],
         cell_offset=np.zeros(1, np.int64),
         inverse_cell=1 / cell_m,
         cells=cells.ravel(),
-        sheets=sheets.astype(np.int32),
+        sheets=sheets,
         nodes=np.concatenate([records, extras]),
         occupancy=np.zeros(len(base), np.uint8),
         away=np.zeros(cells.size, np.uint8),
@@ -133,8 +135,9 @@ def occupied(tables: WarpTables, occupancy: Occupancy, *, extent: float = 0.0) -
     """
     found = np.empty_like(tables.occupancy)
     octant_occupancy(
-        tables, occupancy.sums, occupancy.origin, 1 / occupancy.spacing_m, extent, found
-    )
+        tables, occupancy.sums, occupancy.coarse_sums, occupancy.origin, 1 / occupancy.spacing_m,
+        extent, found,
+    )  # fmt: skip
     return with_octants(tables, found)
 
 

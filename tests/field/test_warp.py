@@ -9,7 +9,7 @@ import torch
 from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.field.canonical import canonical_body
-from ntop.field.kernels.posing import nearest_vertices
+from ntop.field.kernels.nearest import nearest_vertices
 from ntop.field.warp import joined, pose_warp
 from tests.field.ways_back import ways_back
 

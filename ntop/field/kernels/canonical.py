@@ -4,7 +4,7 @@ import numba
 import numpy as np
 
 from ntop.field.kernels import kernel
-from ntop.field.kernels.posing import closest_on_surface
+from ntop.field.kernels.posing import closest_on_surface, mean_of
 from ntop.field.kernels.tables import grid_corners, interpolate
 
 
@@ -22,22 +22,19 @@ def signed_distances(
     """
     for n in numba.prange(nodes.shape[0]):
         node = nodes[n]
-        p = np.empty(3, np.float64)
-        weights = np.empty(3, np.float64)
-        p[0] = (node // (dims[1] * dims[2])) * spacing
-        p[1] = (node // dims[2] % dims[1]) * spacing
-        p[2] = (node % dims[2]) * spacing
-        face, squared = closest_on_surface(
-            p, nearest[node], vertices, faces, ring_offsets, ring_faces, weights
+        p = (
+            (node // (dims[1] * dims[2])) * spacing,
+            (node // dims[2] % dims[1]) * spacing,
+            (node % dims[2]) * spacing,
         )
+        face, squared, a, b, c = closest_on_surface(
+            p, nearest[node], vertices, faces, ring_offsets, ring_faces
+        )
+        corners, weights = (faces[face, 0], faces[face, 1], faces[face, 2]), (a, b, c)
         side = 0.0
         for i in range(3):
-            normal, point = 0.0, 0.0
-            for corner in range(3):
-                u = faces[face, corner]
-                normal += weights[corner] * normals[u, i]
-                point += weights[corner] * vertices[u, i]
-            side += normal * (p[i] - point)
+            point = mean_of(weights, corners, vertices, i)
+            side += mean_of(weights, corners, normals, i) * (p[i] - point)
         distances[n] = np.sqrt(squared) if side >= 0 else -np.sqrt(squared)
 
 

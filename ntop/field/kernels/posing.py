@@ -1,4 +1,4 @@
-"""Build one pose's warp grid: nearest surface, canonical positions of nodes, sheets of cells.
+"""Build one pose's warp grid: the way back of vertices, and of nodes from the nearest surface.
 
 Twin of the geometry: `tests/field/test_warp.py` compares with brute force and forward skinning.
 """
@@ -16,7 +16,6 @@ MAIN_SHARE = 0.02  # of the main bone: it decides directions that blending has c
 LEAST_RISE = 0.5  # of a point's distance from the skin: so far it stays above it at least
 TINY_VOLUME = 1e-6
 TINY_LENGTH = 1e-12
-SLAB = 4  # nodes along x that one task owns
 
 
 @device
@@ -85,80 +84,18 @@ def vertex_maps(blended, canonical_from_rest, canonical, posed, bones, main_bone
 
 
 @device
-def squared_gap(one, other, x, y, z):
-    """Squared distance of the places to which two affine maps (3, 4) send a point."""
-    gap = 0.0
-    for a in range(3):
-        gap += (
-            (one[a, 0] - other[a, 0]) * x
-            + (one[a, 1] - other[a, 1]) * y
-            + (one[a, 2] - other[a, 2]) * z
-            + (one[a, 3] - other[a, 3])
-        ) ** 2
-    return gap
-
-
-@kernel
-def nearest_vertices(posed, maps, dims, cell, radius, apart, candidates, nearest, distance):
-    """For each node the nearest posed vertex, and the nearest that leads elsewhere.
-
-    Args:
-        posed: (V, 3) metres relative to node (0, 0, 0).
-        maps: (V, 3, 4) posed -> canonical, read for the second candidate only.
-        dims: (3,) nodes. cell: node spacing (m). radius: search radius (m).
-        apart: distance (m) of the two canonical places of a node from which a vertex leads
-            elsewhere. Both sides of a wrist lead to the same place, an arm and a trunk do not.
-        candidates: 1 or 2; with 1 the second is left empty.
-        nearest: (2, nodes) int32 output, -1 where none. distance: (2, nodes) squared metres.
-    """
-    ny, nz = dims[1], dims[2]
-    limit = radius * radius
-    inverse = 1 / cell
-    for slab in numba.prange((dims[0] + SLAB - 1) // SLAB):
-        first, last = slab * SLAB, min(dims[0], (slab + 1) * SLAB) - 1
-        for n in range(first * ny * nz, (last + 1) * ny * nz):
-            nearest[0, n] = nearest[1, n] = -1
-            distance[0, n] = distance[1, n] = limit
-        for candidate in range(candidates):
-            for v in range(posed.shape[0]):
-                x, y, z = posed[v, 0], posed[v, 1], posed[v, 2]
-                i0 = max(first, int(math.ceil((x - radius) * inverse)))
-                i1 = min(last, int(math.floor((x + radius) * inverse)))
-                if i0 > i1:
-                    continue
-                j0 = max(0, int(math.ceil((y - radius) * inverse)))
-                j1 = min(ny - 1, int(math.floor((y + radius) * inverse)))
-                k0 = max(0, int(math.ceil((z - radius) * inverse)))
-                k1 = min(nz - 1, int(math.floor((z + radius) * inverse)))
-                for i in range(i0, i1 + 1):
-                    dx = (i * cell - x) ** 2
-                    for j in range(j0, j1 + 1):
-                        dxy = dx + (j * cell - y) ** 2
-                        if dxy >= limit:
-                            continue
-                        for k in range(k0, k1 + 1):
-                            d = dxy + (k * cell - z) ** 2
-                            n = (i * ny + j) * nz + k
-                            if d < distance[candidate, n]:
-                                if candidate == 1:
-                                    gap = squared_gap(
-                                        maps[v], maps[nearest[0, n]], i * cell, j * cell, k * cell
-                                    )
-                                    if gap < apart * apart:
-                                        continue
-                                distance[candidate, n] = d
-                                nearest[candidate, n] = v
-
-
-@device
-def closest_weights(p, a, b, c):
-    """Barycentric weights of the point of triangle abc closest to p, and the squared distance.
+def closest_weights(p, vertices, i, j, k):
+    """Barycentric weights of the point of a triangle closest to p, and the squared distance.
 
     Regions of the triangle as in Ericson, Real-Time Collision Detection, 5.1.5.
+
+    Args:
+        p: Three coordinates. vertices: (V, 3). i, j, k: the triangle's.
     """
-    ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    ap0, ap1, ap2 = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    a0, a1, a2 = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+    ab0, ab1, ab2 = vertices[j, 0] - a0, vertices[j, 1] - a1, vertices[j, 2] - a2
+    ac0, ac1, ac2 = vertices[k, 0] - a0, vertices[k, 1] - a1, vertices[k, 2] - a2
+    ap0, ap1, ap2 = p[0] - a0, p[1] - a1, p[2] - a2
     d1 = ab0 * ap0 + ab1 * ap1 + ab2 * ap2
     d2 = ac0 * ap0 + ac1 * ap1 + ac2 * ap2
     aa = ab0 * ab0 + ab1 * ab1 + ab2 * ab2
@@ -189,21 +126,19 @@ def closest_weights(p, a, b, c):
 
 
 @device
-def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces, weights):
-    """Face around vertex v whose surface is closest to p; fills its weights (3).
+def closest_on_surface(p, v, vertices, faces, ring_offsets, ring_faces):
+    """Face around vertex v whose surface is closest to p, three coordinates.
 
-    Returns the face and the squared distance; face -1 where no face has the vertex.
+    Returns the face (-1 where no face has the vertex), the squared distance and the three weights.
     """
     best, chosen = np.inf, -1
+    a = b = c = 0.0
     for r in range(ring_offsets[v], ring_offsets[v + 1]):
         f = ring_faces[r]
-        a, b, c, d = closest_weights(
-            p, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        )
+        wa, wb, wc, d = closest_weights(p, vertices, faces[f, 0], faces[f, 1], faces[f, 2])
         if d < best:
-            best, chosen = d, f
-            weights[0], weights[1], weights[2] = a, b, c
-    return chosen, best
+            best, chosen, a, b, c = d, f, wa, wb, wc
+    return chosen, best, a, b, c
 
 
 @device
@@ -215,6 +150,16 @@ def lift(place, height, foot, normal):
     if missing > 0:
         for i in range(3):
             place[i] += missing * normal[i]
+
+
+@device
+def mean_of(weights, corners, values, axis):
+    """Weighted mean of three vertices' values (V, any)."""
+    return (
+        weights[0] * values[corners[0], axis]
+        + weights[1] * values[corners[1], axis]
+        + weights[2] * values[corners[2], axis]
+    )
 
 
 @device
@@ -231,48 +176,48 @@ def way_back(
     directions, and some would lead into the leg again.
 
     Args:
-        p: (3,) metres, as `posed`. v: vertex nearest to p (or nearest of one part).
+        p: three coordinates, metres, as `posed`. v: vertex nearest to p (or nearest of one part).
         posed, canonical, normals, canonical_normals: (V, 3). maps: (V, 3, 4) posed -> canonical.
         record: (6,) output.
 
     Returns:
         Squared distance of p to the surface, and how far it is above it (negative: inside).
     """
-    weights = np.empty(3, np.float64)
-    face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
+    face, squared, a, b, c = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces)
     last = np.inf
     while squared < last:  # the closest vertex need not be a corner of the closest face
-        heaviest = 0
-        for corner in range(1, 3):
-            if weights[corner] > weights[heaviest]:
-                heaviest = corner
-        if faces[face, heaviest] == v:
+        heaviest = faces[face, 0]
+        if b > a:
+            heaviest = faces[face, 1]
+        if c > max(a, b):
+            heaviest = faces[face, 2]
+        if heaviest == v:
             break
-        v, last = faces[face, heaviest], squared
-        face, squared = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces, weights)
-    x, y, z = p[0], p[1], p[2]  # becomes p - q
-    for corner in range(3):
-        u = faces[face, corner]
-        x -= weights[corner] * posed[u, 0]
-        y -= weights[corner] * posed[u, 1]
-        z -= weights[corner] * posed[u, 2]
-    foot, upward = np.zeros(3, np.float64), np.zeros(3, np.float64)
+        v, last = heaviest, squared
+        face, squared, a, b, c = closest_on_surface(p, v, posed, faces, ring_offsets, ring_faces)
+    corners, weights = (faces[face, 0], faces[face, 1], faces[face, 2]), (a, b, c)
+    x = p[0] - mean_of(weights, corners, posed, 0)
+    y = p[1] - mean_of(weights, corners, posed, 1)
+    z = p[2] - mean_of(weights, corners, posed, 2)
     for i in range(3):
-        offset, normal = 0.0, 0.0
+        offset = 0.0
         for corner in range(3):
-            u = faces[face, corner]
-            m = maps[u, i]
-            foot[i] += weights[corner] * canonical[u, i]
-            upward[i] += weights[corner] * canonical_normals[u, i]
-            offset += weights[corner] * (m[0] * x + m[1] * y + m[2] * z)
-            normal += weights[corner] * normals[u, i]
-        record[i] = foot[i] + offset
-        record[3 + i] = normal
+            u = corners[corner]
+            offset += weights[corner] * (maps[u, i, 0] * x + maps[u, i, 1] * y + maps[u, i, 2] * z)
+        record[i] = mean_of(weights, corners, canonical, i) + offset
+        record[3 + i] = mean_of(weights, corners, normals, i)
     height = x * record[3] + y * record[4] + z * record[5]
     if height > 0:
-        length = math.sqrt(upward[0] ** 2 + upward[1] ** 2 + upward[2] ** 2)
-        for i in range(3):
-            upward[i] /= max(length, TINY_LENGTH)
+        foot = (
+            mean_of(weights, corners, canonical, 0),
+            mean_of(weights, corners, canonical, 1),
+            mean_of(weights, corners, canonical, 2),
+        )
+        up_x = mean_of(weights, corners, canonical_normals, 0)
+        up_y = mean_of(weights, corners, canonical_normals, 1)
+        up_z = mean_of(weights, corners, canonical_normals, 2)
+        length = max(math.sqrt(up_x * up_x + up_y * up_y + up_z * up_z), TINY_LENGTH)
+        upward = (up_x / length, up_y / length, up_z / length)
         lift(record, LEAST_RISE * math.sqrt(squared), foot, upward)
     return squared, height
 
@@ -291,10 +236,11 @@ def node_records(
     """
     for n in numba.prange(node_ids.shape[0]):
         node, candidate = node_ids[n, 0], node_ids[n, 1]
-        p = np.empty(3, np.float64)
-        p[0] = (node // (dims[1] * dims[2])) * cell
-        p[1] = (node // dims[2] % dims[1]) * cell
-        p[2] = (node % dims[2]) * cell
+        p = (
+            (node // (dims[1] * dims[2])) * cell,
+            (node // dims[2] % dims[1]) * cell,
+            (node % dims[2]) * cell,
+        )
         distance[candidate, node], height = way_back(
             p, nearest[candidate, node], posed, canonical, faces, ring_offsets, ring_faces, maps,
             normals, canonical_normals, records[n],

@@ -8,12 +8,45 @@ import numpy as np
 from ntop.field.kernels import device, kernel
 from ntop.field.kernels.posing import LEAST_RISE, lift
 
+CHUNK = 512  # cells that share their scratch memory: allocating it costs as much as a plain cell
+
 
 @device
 def apply_map(m, x, y, z, out):
     """Out = affine map (3, 4) of a point."""
     for i in range(3):
         out[i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+
+
+@device
+def squared_gaps(maps, v, first, cell, records, chosen, gaps):
+    """Squared distance of each record of a cell from where a vertex's map puts its corner.
+
+    Args:
+        maps: (V, 3, 4). v: the vertex. first: (3,) node numbers of the cell's corner 0. cell: node
+            spacing (m).
+        chosen: (8, 2) record of each corner and candidate, or -1. gaps: (8, 2) output.
+    """
+    x, y, z = first[0] * cell, first[1] * cell, first[2] * cell
+    for corner in range(8):
+        for candidate in range(2):
+            gaps[corner, candidate] = 0.0
+    for axis in range(3):
+        mx, my, mz = maps[v, axis, 0], maps[v, axis, 1], maps[v, axis, 2]
+        along_x, along_y, along_z = mx * cell, my * cell, mz * cell
+        start = mx * x + my * y + mz * z + maps[v, axis, 3]
+        for corner in range(8):
+            place = start
+            if corner & 4:
+                place += along_x
+            if corner & 2:
+                place += along_y
+            if corner & 1:
+                place += along_z
+            for candidate in range(2):
+                record = chosen[corner, candidate]
+                if record >= 0:
+                    gaps[corner, candidate] += (records[record, axis] - place) ** 2
 
 
 @kernel
@@ -41,70 +74,65 @@ def cell_sheets(
         sheets: (cells, 2, 8): record number, or -2 - e for extra e of this cell (-1: no sheet).
         extra_count: (cells,). extra: (cells, 16, 6) output.
     """
-    for number in numba.prange(cell_ids.shape[0]):
-        base = cell_ids[number]
-        bx, by = base // (dims[1] * dims[2]), base // dims[2] % dims[1]
-        bz = base % dims[2]
-        predicted = np.empty(3, np.float64)
-        used = 0
-        first_vertex = -1
-        for sheet in range(2):
-            start, start_candidate, start_corner = np.inf, -1, -1
+    cells, near = cell_ids.shape[0], agree * agree
+    for chunk in numba.prange((cells + CHUNK - 1) // CHUNK):
+        predicted, first = np.empty(3, np.float64), np.empty(3, np.int64)
+        nodes, chosen = np.empty(8, np.int64), np.empty((8, 2), np.int32)
+        gaps, squared = np.empty((8, 2), np.float64), np.empty((8, 2), distance.dtype)
+        for number in range(chunk * CHUNK, min(cells, (chunk + 1) * CHUNK)):
+            base = cell_ids[number]
+            first[0], first[1] = base // (dims[1] * dims[2]), base // dims[2] % dims[1]
+            first[2] = base % dims[2]
+            start, vertex = np.inf, -1
             for corner in range(8):
                 i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
                 node = base + (i * dims[1] + j) * dims[2] + k
+                nodes[corner] = node
                 for candidate in range(2):
-                    record = record_of[candidate, node]
-                    if record < 0 or distance[candidate, node] >= start:
-                        continue
-                    if sheet == 1:
-                        if distance[candidate, node] > reach * reach:
-                            continue
-                        apply_map(
-                            maps[first_vertex], (bx + i) * cell, (by + j) * cell, (bz + k) * cell,
-                            predicted,
-                        )  # fmt: skip
-                        gap = 0.0
-                        for a in range(3):
-                            gap += (records[record, a] - predicted[a]) ** 2
-                        if gap < agree * agree:
-                            continue
-                    start, start_candidate, start_corner = (
-                        distance[candidate, node],
-                        candidate,
-                        corner,
-                    )
-            if start_corner < 0:
-                sheets[number, sheet, 0] = -1
-                continue
-            i, j, k = start_corner >> 2, (start_corner >> 1) & 1, start_corner & 1
-            vertex = nearest[start_candidate, base + (i * dims[1] + j) * dims[2] + k]
-            if sheet == 0:
-                first_vertex = vertex
-            for corner in range(8):
-                i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
-                node = base + (i * dims[1] + j) * dims[2] + k
-                apply_map(
-                    maps[vertex], (bx + i) * cell, (by + j) * cell, (bz + k) * cell, predicted
-                )
-                best, chosen = agree * agree, -1
-                for candidate in range(2):
-                    record = record_of[candidate, node]
+                    chosen[corner, candidate] = record_of[candidate, node]
+                    squared[corner, candidate] = distance[candidate, node]
+                    if chosen[corner, candidate] >= 0 and squared[corner, candidate] < start:
+                        start, vertex = squared[corner, candidate], nearest[candidate, node]
+            used = 0
+            for sheet in range(2):
+                if sheet == 1:
+                    start, vertex = np.inf, -1
+                    for corner in range(8):
+                        for candidate in range(2):
+                            if (
+                                chosen[corner, candidate] >= 0
+                                and not gaps[corner, candidate] < near
+                                and squared[corner, candidate] < start
+                                and squared[corner, candidate] <= reach * reach
+                            ):
+                                start = squared[corner, candidate]
+                                vertex = nearest[candidate, nodes[corner]]
+                if vertex < 0:
+                    sheets[number, sheet] = -1
+                    continue
+                squared_gaps(maps, vertex, first, cell, records, chosen, gaps)
+                for corner in range(8):
+                    best, record = near, -1
+                    for candidate in range(2):
+                        if chosen[corner, candidate] >= 0 and gaps[corner, candidate] < best:
+                            best, record = gaps[corner, candidate], chosen[corner, candidate]
                     if record >= 0:
-                        gap = 0.0
-                        for a in range(3):
-                            gap += (records[record, a] - predicted[a]) ** 2
-                        if gap < best:
-                            best, chosen = gap, record
-                if chosen >= 0:
-                    sheets[number, sheet, corner] = chosen
-                else:
-                    if record_of[0, node] >= 0 and outside[record_of[0, node]]:
-                        height = LEAST_RISE * math.sqrt(distance[0, node])
+                        sheets[number, sheet, corner] = record
+                        continue
+                    apply_map(
+                        maps[vertex],
+                        (first[0] + (corner >> 2)) * cell,
+                        (first[1] + ((corner >> 1) & 1)) * cell,
+                        (first[2] + (corner & 1)) * cell,
+                        predicted,
+                    )
+                    own = chosen[corner, 0]
+                    if own >= 0 and outside[own]:
+                        height = LEAST_RISE * math.sqrt(squared[corner, 0])
                         lift(predicted, height, canonical[vertex], canonical_normals[vertex])
                     sheets[number, sheet, corner] = -2 - used
-                    for a in range(3):
-                        extra[number, used, a] = predicted[a]
-                        extra[number, used, 3 + a] = normals[vertex, a]
+                    for axis in range(3):
+                        extra[number, used, axis] = predicted[axis]
+                        extra[number, used, 3 + axis] = normals[vertex, axis]
                     used += 1
-        extra_count[number] = used
+            extra_count[number] = used

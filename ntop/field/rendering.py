@@ -302,11 +302,12 @@ def render_view(
                 posed, camera, centres[chosen], first=first, chosen=chosen,
                 offsets_px=np.array(offsets), settings=settings, spans_m=some,
             )  # fmt: skip
-    alpha[inner] = box.image(first.alpha)
-    rgb[inner] = straight_colours(box.image(first.rgb), alpha[inner])
-    depth[inner], parts[inner] = box.image(first.depth_m), box.image(first.parts)
-    empty = np.rint(255 * alpha) < MASK_ALPHA
-    depth[empty], parts[empty] = 0, 0
+    opacity = box.image(first.alpha)
+    bodyless = np.rint(255 * opacity) < MASK_ALPHA
+    alpha[inner] = opacity
+    rgb[inner] = straight_colours(box.image(first.rgb), opacity)
+    depth[inner] = np.where(bodyless, 0, box.image(first.depth_m))
+    parts[inner] = np.where(bodyless, 0, box.image(first.parts))
     return Rendering(rgb, alpha, depth, parts, window, first.voxels, first.samples)
 
 

@@ -26,6 +26,7 @@ from ntop.field.kernels.tiles import outer_cells
 APART_M = 0.12  # canonical distance between a point's two places that are worth keeping both
 AGREE_M = 0.03  # corners of one sheet lie this close to where their neighbour's map puts them
 EXTRA_PER_CELL = 16
+CELLS_AT_ONCE = 1 << 14  # 6 MB of extras: larger arrays would be new memory for every pose
 MAX_NODES = 3e7  # a person with spread limbs has 4e6 at 12 mm; 16 bytes each
 BLOCK = 4  # cells; distances to what is occupied are counted in blocks beyond the next ones
 MAX_AWAY = 8  # blocks; how far a ray may jump over empty space at once
@@ -102,25 +103,30 @@ def pose_warp(
     cells = _cells_near(distance[0].reshape(dims), reach_m, cell_m)
     cell_ids = np.flatnonzero(cells >= 0)
     base = np.ravel_multi_index(np.unravel_index(cell_ids, cells.shape), dims)
-    sheets = np.empty((len(base), 2, 8), np.int32)
-    extra_count = np.empty(len(base), np.int32)
-    extra = np.empty((len(base), EXTRA_PER_CELL, 6), np.float32)
-    cell_sheets(
-        base, dims, cell_m, nearest, distance, record_of, records, outside, maps, normals,
-        body.vertices, body.normals, reach_m, AGREE_M, sheets, extra_count, extra,
-    )  # fmt: skip
-    extended = np.flatnonzero(extra_count)  # few cells; the others' sheets are records alone
-    counts, own = extra_count[extended], sheets[extended]
-    first = len(records) + np.cumsum(counts, dtype=np.int32) - counts
-    sheets[extended] = np.where(own <= -2, first[:, None, None] - 2 - own, own)
-    extras = extra[extended][np.arange(EXTRA_PER_CELL) < counts[:, None]]
+    sheets, extras = np.empty((len(base), 2, 8), np.int32), []
+    numbered = len(records)
+    for start in range(0, len(base), CELLS_AT_ONCE):
+        some = slice(start, start + CELLS_AT_ONCE)
+        extra_count = np.empty(len(base[some]), np.int32)
+        extra = np.empty((len(base[some]), EXTRA_PER_CELL, 6), np.float32)
+        cell_sheets(
+            base[some], dims, cell_m, nearest, distance, record_of, records, outside, maps,
+            normals, body.vertices, body.normals, reach_m, AGREE_M, sheets[some], extra_count,
+            extra,
+        )  # fmt: skip
+        extended = np.flatnonzero(extra_count)  # few cells; the others' sheets are records alone
+        counts, own = extra_count[extended], sheets[some][extended]
+        first = numbered + np.cumsum(counts, dtype=np.int32) - counts
+        sheets[start + extended] = np.where(own <= -2, first[:, None, None] - 2 - own, own)
+        extras.append(extra[extended][np.arange(EXTRA_PER_CELL) < counts[:, None]])
+        numbered += len(extras[-1])
     tables = WarpTables(
         dims=(dims - 1)[None],
         cell_offset=np.zeros(1, np.int64),
         inverse_cell=1 / cell_m,
         cells=cells.ravel(),
         sheets=sheets,
-        nodes=np.concatenate([records, extras]),
+        nodes=np.concatenate([records, *extras]),
         occupancy=np.zeros(len(base), np.uint8),
         away=np.zeros(cells.size, np.uint8),
     )

@@ -30,7 +30,6 @@ from ntop.field.canonical import (
     initial_grid,
     label_grid,
 )
-from ntop.field.kernels.posing import MAX_STRETCH
 from ntop.field.kernels.tables import EMPTY_RAW
 from ntop.field.rendering import PosedAvatar, Rendering, RenderSettings, render_view
 from ntop.field.warp import MAX_NODES, occupied, pose_warp
@@ -50,6 +49,7 @@ from ntop.storage.tables import write_table
 
 BETAS = (0.0,) * 10
 CELL_M, REACH_M = 0.06, 0.03
+STRETCH = 6.0  # of canonical lengths against posed ones: no map of a vertex has as much
 MEMORY_LIMIT_MB = 1500
 
 
@@ -197,7 +197,7 @@ def finite_or_refused(make_lens, center, turn, pose, kind, step_m, edge_rays):
     # a ray crosses at most so many octants; in each, the faces of voxels on the way of either sheet
     # and the nodes of the lattice cut it into pieces: a look-up of the voxel, two densities a sheet
     octants = 2 * int(tables.dims[0].sum()) + 3
-    faces = 3 * (MAX_STRETCH * avatar.warp.cell_m / avatar.grid.voxel_m + 1)
+    faces = 3 * (STRETCH * avatar.warp.cell_m / avatar.grid.voxel_m + 1)
     length_m = float(np.linalg.norm(tables.dims[0])) * avatar.warp.cell_m
     pieces = octants * (2 * faces + 1) + length_m / step_m
     rays = lens.width * lens.height * (1 + (4 if edge_rays > 1 else 0))

@@ -20,7 +20,7 @@ AXES = {
 }  # fmt: skip
 
 STYLES = {  # name and colour of each field
-    "grid": ("grid + light (default)", "#3b6ea5"), "grid_even": ("grid, even light", "#8a8f98"),
+    "grid": ("grid + light", "#3b6ea5"), "grid_even": ("grid, even light", "#8a8f98"),
     "grid_head": ("grid + light + head", "#4a9a5b"), "humannerf": ("HumanNeRF twin", "#c2572b"),
 }  # fmt: skip
 

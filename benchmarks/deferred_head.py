@@ -1,9 +1,10 @@
 """A deferred head: a tiny network that corrects every rendered pixel of a trained grid.
 
-It knows of a pixel what the grid does not use: the direction of the ray, in the world and relative
-to the body, the pose, and where on the person the pixel lies. It learns from the photographs that
-the grid was trained on, and those set aside choose its best state; before its first step it changes
-nothing. An ablation, not a part of the package: docs/decisions/0022-no-deferred-head.md.
+It knows a pixel's colour and, by choice, the surface's normal, the direction of the ray in the
+world and relative to the body, the pose, and where on the person the pixel lies. It learns from
+the photographs that the grid was trained on, and those set aside choose its best state; before
+its first step it changes nothing. An ablation, not a part of the package:
+docs/decisions/0022-no-deferred-head.md.
 """
 
 import copy

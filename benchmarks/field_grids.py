@@ -21,6 +21,7 @@ from ntop.storage.atomic import write_bytes
 
 PROBES = (10, 60)  # steps of the grid, to learn what a step and the poses' warps cost
 HEAD_SHARE = 0.15  # of a budget; half of it for pictures to learn from
+HEAD_GROUPS = ("normal",)  # the best from above; view, pose and place lose: decision 0022
 LOSS = "colour, mask, priors"
 
 
@@ -106,7 +107,7 @@ def run_head(bench: Bench, avatar: Avatar, budget_s: float) -> tuple[Correction,
     def spent(share: float) -> float:
         return (time.monotonic() - started) / max(share * budget_s, 1e-3)
 
-    describer = Describer(PoseCode.of(bench.views.poses))
+    describer = Describer(PoseCode.of(bench.views.poses), HEAD_GROUPS)
     pixels = functools.partial(photographed, avatar, bench.model, bench.views, describer)
     watched = pixels(watched=True, spent=lambda: spent(0.15))
     seen = pixels(watched=False, spent=lambda: spent(0.5))

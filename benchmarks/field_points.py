@@ -19,6 +19,11 @@ AXES = {
     "mask_iou": "mask IoU", "depth_error_mm": "depth error (mm)",
 }  # fmt: skip
 
+STYLES = {  # name and colour of each field
+    "grid": ("grid + light", "#3b6ea5"), "grid_even": ("grid, even light", "#8a8f98"),
+    "grid_head": ("grid + light + head", "#4a9a5b"), "humannerf": ("HumanNeRF twin", "#c2572b"),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Point:
@@ -53,9 +58,8 @@ def plot(points: list[Point], path: Path) -> None:
     """Each score over training seconds; hollow marks are unconverged."""
     mpl.use("agg")
     figure, axes = plt.subplots(1, len(AXES), figsize=(15, 3.2), dpi=110)
-    styles = {"grid": ("grid", "#3b6ea5"), "humannerf": ("HumanNeRF twin", "#c2572b")}
     for axis, (metric, label) in zip(axes, AXES.items(), strict=True):
-        for field, (name, colour) in styles.items():
+        for field, (name, colour) in STYLES.items():
             line = [p for p in points if p.field == field and getattr(p.scores, metric) is not None]
             x, y = [p.seconds for p in line], [getattr(p.scores, metric) for p in line]
             axis.plot(x, y, color=colour, label=name)

@@ -10,6 +10,10 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/benchmarks.md"
 RESULTS = ROOT / "benchmarks/results"
+VARIANTS = {
+    "grid": "grid + light", "grid_even": "grid, even light", "grid_head": "grid + light + head",
+    "humannerf": "HumanNeRF twin",
+}  # fmt: skip
 START, END = "<!-- field -->\n", "<!-- gpu -->"
 
 
@@ -22,11 +26,56 @@ def main() -> None:
 def sections(results: Path) -> str:
     """All sections whose figures lie in the folder."""
     lines = [""]
-    for name, section in (("robustness", robustness_lines), ("budget", budget_lines)):
+    written = {"field": field_lines, "robustness": robustness_lines, "budget": budget_lines}
+    for name, section in written.items():
         path = results / f"{name}.json"
         if path.exists():
             lines += [*section(json.loads(path.read_text())), ""]
     return "\n".join([*lines, ""])
+
+
+def field_lines(values: dict[str, Any]) -> list[str]:
+    """The variants in words, then one line per point in the order of the results."""
+    lines = [
+        "## Quality over training time",
+        "",
+        f"`python -m benchmarks.field`: the studio's actor `plain`, {values['pictures']} pictures, "
+        f"{values['scored_views']} true views from above in novel poses. Seconds are those of "
+        "training alone, after compilation and decoding. "
+        f"The twin ran on: {values['device']}. {where(values)}",
+        "",
+        "* **grid + light**: the default; light that depends on the surface's direction in the "
+        "world is learned with the colours.",
+        "* **grid, even light**: the same without it, as long.",
+        "* **grid + light + head**: a shorter training of the default, then a deferred head in the "
+        "rest of the budget: a tiny network that corrects every pixel of a finished picture "
+        "([decision 0022](decisions/0022-no-deferred-head.md)).",
+        "* **HumanNeRF twin**: the paper's method; hollow marks in the plot are unconverged.",
+        "",
+        "![Quality over training time](../benchmarks/results/field.png)",
+        "",
+        "| variant | training (s) | steps | PSNR, box (dB) | SSIM | LPIPS | mask IoU "
+        "| median depth error (mm) | s per view |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for point in values["points"]:
+        scores = point["scores"]
+        lpips, depth_mm = scores["lpips_vgg"], scores["depth_error_mm"]
+        lines.append(
+            f"| {VARIANTS[point['field']]}{'' if point['converged'] else ', unconverged'} | "
+            f"{point['seconds']:.1f} | {point['iterations']} | {scores['psnr_box_db']:.2f} | "
+            f"{scores['ssim_box']:.3f} | {'' if lpips is None else f'{lpips:.3f}'} | "
+            f"{scores['mask_iou']:.4f} | {'' if depth_mm is None else f'{depth_mm:.1f}'} | "
+            f"{point['render_s_per_view']:.2f} |"
+        )
+    wins = values["twin_wins"]
+    won = ", ".join(sorted({win["metric"] for win in wins})) or "none"
+    return [
+        *lines,
+        "",
+        f"Metrics in which some state of the twin is better than a default grid that was trained "
+        f"for no longer: {won}.",
+    ]
 
 
 def robustness_lines(values: dict[str, Any]) -> list[str]:

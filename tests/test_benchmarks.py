@@ -1,13 +1,17 @@
 """What the field's benchmarks rest on, and that their page shows what was measured."""
 
 import importlib.util
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from benchmarks.error_parts import SLOW_SIGMA_PX, diagnosis, scores
+from benchmarks.field_points import STYLES, Point, plot
 from benchmarks.filled import clothed_model
+from benchmarks.studio import Scores
 from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.captures.studio.actors import dress_actor, pose_actor
@@ -32,6 +36,38 @@ def test_the_page_shows_the_committed_figures():
 
 def test_a_page_without_figures_has_no_sections(tmp_path):
     assert page_script().sections(tmp_path).split() == []
+
+
+def points() -> list[Point]:
+    """One point of every field; without LPIPS, as where its weights were not fetched."""
+    found = Scores(30.0, 0.95, 0.99, 2.0, None)
+    first = Point("grid", 10.0, 9.5, 80, True, "colour", 0.1, found)
+    return [
+        replace(first, field=field, seconds=9.5 + k, converged=field != "humannerf")
+        for k, field in enumerate(STYLES)
+    ]
+
+
+def test_the_page_has_a_line_for_a_point_of_every_field(tmp_path):
+    script = page_script()
+    assert {field: name for field, (name, _) in STYLES.items()} == script.VARIANTS
+    values = {
+        "device": "cpu", "pictures": 160, "scored_views": 12, "twin_wins": [],
+        "points": [asdict(point) for point in points()],
+        "environment": {"cores": 2, "cpu": "any", "commit": "0"},
+    }  # fmt: skip
+    (tmp_path / "field.json").write_text(json.dumps(values))
+    page = script.sections(tmp_path)
+    for k, (name, _) in enumerate(STYLES.values()):
+        (line,) = (line for line in page.splitlines() if f"| {9.5 + k:.1f} |" in line)
+        assert line.startswith(f"| {name}")
+        assert ("unconverged" in line) == ("HumanNeRF" in name)
+
+
+def test_the_plot_takes_points_of_every_field(tmp_path):
+    plot(points(), tmp_path / "all.png")
+    plot(points()[:1], tmp_path / "one.png")
+    assert (tmp_path / "all.png").read_bytes() != (tmp_path / "one.png").read_bytes()
 
 
 def test_the_clothed_model_moves_as_the_actor_does():

@@ -22,10 +22,10 @@ from ntop.field.views import RayBatch, RaySource, TrainingViews
 from ntop.geometry.rotations import cross_matrix, matrix_from_axis_angle
 
 RAYS, VIEWS = 2048, 64  # of one update
-EVERY = 4  # steps
-RATE = (0.5, 0.1)  # share of the way to the batch's optimum, from the first to the last step
+EVERY = 2  # steps
+RATE = (1.0, 0.3)  # share of the way to the batch's optimum, from the first to the last step
 MEMORY = 0.9  # of the curvature, per update
-NUDGE = 0.25  # of a voxel: how far rays move for their slopes
+NUDGE_M = (0.03, 0.003)  # how far rays move for their slopes, from the first to the last step
 LEVER_M = 0.5  # of a turn: half a person
 PRIOR = np.repeat([30.0, 30.0], 3)  # per ray, rad^-2 and m^-2; a ray's curvature is near 1000 m^-2
 TURN, SHIFT = slice(0, 3), slice(3, 6)  # of a correction's six numbers
@@ -107,17 +107,17 @@ class Refiner:
         *,
         gain: Float[np.ndarray, "camera 2 3"],
         rule: StepRule,
-        voxel_m: float,
         step: int,
     ) -> Twists:
         """Twists after the update that is due at this step, if one is."""
         settings = self._settings
         if step % EVERY or level_at(step, settings) == 0:  # the first level is too coarse to tell
             return twists
+        nudge_m, rate = (decayed(pair, step / settings.steps) for pair in (NUDGE_M, RATE))
         counter = RANDOM_COUNTER + step
         generator = np.random.Generator(np.random.Philox(key=settings.seed, counter=counter))
         batch = self.moved(source.draw(RAYS, num_views=VIEWS, generator=generator), twists)
-        curvature, slopes = self._normal_equations(batch, learner, gain, rule, NUDGE * voxel_m)
+        curvature, slopes = self._normal_equations(batch, learner, gain, rule, nudge_m)
         sums = np.zeros((self.num_twists, 6, 6)), np.zeros((self.num_twists, 6))
         counts = np.zeros(self.num_twists)
         effects = self._effects(batch)
@@ -130,7 +130,6 @@ class Refiner:
             curvature=MEMORY * twists.curvature + sums[0],
             rays=MEMORY * twists.rays + counts,
         )
-        rate = decayed(RATE, step / settings.steps)
         for i in np.flatnonzero(self._learned & (counts > 0)):
             bowl = twists.curvature[i] / twists.rays[i] + np.diag(PRIOR)
             slope = sums[1][i] / counts[i] + PRIOR * twists.values[i]

@@ -136,7 +136,7 @@ class GridTrainer:
             return state.twists
         return self._refiner.learn(
             state.twists, source, self._learner, gain=state.gain, rule=rule,
-            voxel_m=state.grid.voxel_m, step=state.step,
+            step=state.step,
         )  # fmt: skip
 
     def _with_patch(self, sums: StepSums, loss: PerceptualLoss, rule: StepRule) -> StepSums:

@@ -27,7 +27,7 @@ RATE = (1.0, 0.3)  # share of the way to the batch's optimum, from the first to 
 MEMORY = 0.9  # of the curvature, per update
 NUDGE_M = (0.03, 0.003)  # how far rays move for their slopes, from the first to the last step
 LEVER_M = 0.5  # of a turn: half a person
-PRIOR = np.repeat([30.0, 30.0], 3)  # per ray, rad^-2 and m^-2; a ray's curvature is near 1000 m^-2
+PRIOR = np.full(6, 30.0)  # per ray, rad^-2 and m^-2; a ray's curvature is near 1000 m^-2
 TURN, SHIFT = slice(0, 3), slice(3, 6)  # of a correction's six numbers
 RANDOM_COUNTER = 1 << 61  # of this module's random numbers, far from those of the steps
 

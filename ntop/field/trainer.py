@@ -135,9 +135,8 @@ class GridTrainer:
         if self._refiner is None:
             return state.twists
         return self._refiner.learn(
-            state.twists, source, self._learner, gain=state.gain, rule=rule,
-            step=state.step,
-        )  # fmt: skip
+            state.twists, source, self._learner, gain=state.gain, rule=rule, step=state.step
+        )
 
     def _with_patch(self, sums: StepSums, loss: PerceptualLoss, rule: StepRule) -> StepSums:
         """Add the gradients of the step's patch; the losses that are told stay those of rays."""

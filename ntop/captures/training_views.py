@@ -162,6 +162,8 @@ def _crops(
         pose_of_view=np.array(view_pose),
         poses=poses,
         watched=np.array(watched),
+        camera_names=tuple(keys),
+        pose_names=tuple(frames),
     )
 
 

@@ -22,6 +22,23 @@ from ntop.field.canonical import CanonicalGrid, Occupancy
 
 
 @dataclass(frozen=True)
+class Twists:
+    """Rigid corrections (rotation in rad, translation in m); the rows are `refining.Refiner`'s.
+
+    `curvature` and `rays` are decayed sums of what the updates saw; nothing is refined: no rows.
+    """
+
+    values: Float[np.ndarray, "twist 6"]
+    curvature: Float[np.ndarray, "twist 6 6"]
+    rays: Float[np.ndarray, " twist"]
+
+    @staticmethod
+    def none(count: int) -> "Twists":
+        """Nothing moved, nothing seen."""
+        return Twists(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros(count))
+
+
+@dataclass(frozen=True)
 class TrainingState:
     """Everything a step reads and changes. Arrays are changed in place by the optimiser."""
 
@@ -34,13 +51,19 @@ class TrainingState:
     light_moments: Float[np.ndarray, "2 9 3"]
     gain: Float[np.ndarray, "camera 2 3"]
     gain_moments: Float[np.ndarray, "2 camera 2 3"]
+    twists: Twists
     level: int
     step: int
     curve: list[Any]
 
     @staticmethod
     def fresh(
-        *, grid: CanonicalGrid, occupancy: Occupancy, light: np.ndarray, gain: np.ndarray
+        *,
+        grid: CanonicalGrid,
+        occupancy: Occupancy,
+        light: np.ndarray,
+        gain: np.ndarray,
+        num_twists: int = 0,
     ) -> "TrainingState":
         """Step 0, with empty moments."""
         return TrainingState(
@@ -53,6 +76,7 @@ class TrainingState:
             light_moments=np.zeros((2, *light.shape)),
             gain=gain,
             gain_moments=np.zeros((2, *gain.shape)),
+            twists=Twists.none(num_twists),
             level=0,
             step=0,
             curve=[],
@@ -72,6 +96,7 @@ class TrainingState:
 
 ARRAYS = ("first", "second", "counts", "light", "light_moments", "gain", "gain_moments")
 GRID_ARRAYS = ("values", "bricks", "positions", "origin")
+TWIST_ARRAYS = ("values", "curvature", "rays")
 
 
 def settings_digest(settings: Any) -> str:
@@ -93,6 +118,7 @@ def save_checkpoint(state: TrainingState, path: Path, settings: Any) -> None:
     """Write the state (see `write_checkpoint`)."""
     arrays = {name: getattr(state, name) for name in ARRAYS}
     arrays |= {f"grid_{name}": getattr(state.grid, name) for name in GRID_ARRAYS}
+    arrays |= {f"twist_{name}": getattr(state.twists, name) for name in TWIST_ARRAYS}
     arrays |= {"occupancy": state.occupancy.cells, "occupancy_origin": state.occupancy.origin}
     # the format stores memory as it lies, whatever the strides
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -151,6 +177,7 @@ def load_checkpoint(path: Path, settings: Any, line: type) -> TrainingState | No
         occupancy=Occupancy(
             arrays["occupancy"], arrays["occupancy_origin"], header["occupancy_spacing_m"]
         ),
+        twists=Twists(**{name: arrays[f"twist_{name}"] for name in TWIST_ARRAYS}),
         level=header["level"],
         step=header["step"],
         curve=[line(*values) for values in header["curve"]],

@@ -11,9 +11,17 @@ from numba import cuda
 
 from ntop.conventions import DataError
 from ntop.field.checkpoints import TrainingState
-from ntop.field.kernels.cuda import THREADS, UNITS, adam_step, gather, march_rays, train_rays
+from ntop.field.kernels.cuda import (
+    THREADS,
+    UNITS,
+    adam_step,
+    gather,
+    march_rays,
+    see_rays,
+    train_rays,
+)
 from ntop.field.kernels.tables import WarpTables
-from ntop.field.learners import StepRule, StepSums
+from ntop.field.learners import NO_SLOPES, SeenRays, StepRule, StepSums
 from ntop.field.marching import MarchRule, Rays, Scene, Seen
 from ntop.field.views import RayBatch
 
@@ -115,7 +123,12 @@ class GpuLearner:
         self._sums = _sent(np.zeros(state.grid.values.shape, np.int64))
         self._touched = _sent(np.zeros(len(state.grid.positions), np.uint8))
 
-    def accumulate(self, batch: RayBatch, rule: StepRule) -> StepSums:
+    def accumulate(
+        self,
+        batch: RayBatch,
+        rule: StepRule,
+        extra_slopes: Float[np.ndarray, "any 3"] = NO_SLOPES,
+    ) -> StepSums:
         """See `Learner`.
 
         Raises:
@@ -130,8 +143,8 @@ class GpuLearner:
             _sent(batch.directions), _sent(batch.offsets), _sent(batch.targets),
             _sent(batch.mattes), _sent(batch.colour_weights),
             _sent(batch.matte_weights * rule.matte_weight), _sent(batch.backgrounds),
-            rule.step_m, rule.stop, rule.entropy_weight, self._sums, self._touched, light, gain,
-            losses, broken,
+            _sent(extra_slopes), rule.step_m, rule.stop, rule.entropy_weight, self._sums,
+            self._touched, light, gain, losses, broken,
         )  # fmt: skip
         if broken.copy_to_host()[0]:
             raise DataError(
@@ -139,6 +152,16 @@ class GpuLearner:
                 "bodies or cameras hold broken values: check the fit, then train again"
             )
         return StepSums(_summed(losses), _summed(light), _summed(gain))
+
+    def seen(self, batch: RayBatch, rule: StepRule) -> SeenRays:
+        """See `Learner`."""
+        seen = cuda.device_array((len(batch.poses), 4), np.float64)
+        _launch(
+            see_rays, len(batch.poses), self._grid, self._warp, _sent(self._state.light),
+            _sent(batch.poses), _sent(batch.origins), _sent(batch.directions),
+            _sent(batch.offsets), rule.step_m, rule.stop, seen,
+        )  # fmt: skip
+        return seen.copy_to_host()
 
     def touched(self) -> Int[np.ndarray, " brick"]:
         """See `Learner`."""

@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ntop.field.checkpoints import TrainingState
-from ntop.field.kernels.adjoint import train_rays
+from ntop.field.kernels.adjoint import see_rays, train_rays
 from ntop.field.kernels.learn import adam_step, gather
 from ntop.field.kernels.tables import WarpTables
 from ntop.field.views import RayBatch
+
+NO_SLOPES = np.zeros((0, 3))
+SeenRays = Float[np.ndarray, "ray 4"]  # premultiplied colour and opacity
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,32 @@ class StepSums:
     gain: Float[np.ndarray, "camera 2 3"]
 
 
+def shown_colours(
+    seen: SeenRays, rays: RayBatch, gain: Float[np.ndarray, "camera 2 3"]
+) -> Float[np.ndarray, "ray 3"]:
+    """What the photograph's camera makes of what rays see, over their backgrounds."""
+    opacity = seen[:, 3:]
+    scale, bias = np.exp(gain[rays.cameras, 0]), gain[rays.cameras, 1]
+    return seen[:, :3] * scale + opacity * bias + (1 - opacity) * rays.backgrounds
+
+
 class Learner(Protocol):
     """Holds one level's gradients; `settle` makes the state's arrays hold what was learned."""
 
-    def accumulate(self, batch: RayBatch, rule: StepRule) -> StepSums:
-        """Add the gradients of a batch."""
+    def accumulate(
+        self,
+        batch: RayBatch,
+        rule: StepRule,
+        extra_slopes: Float[np.ndarray, "any 3"] = NO_SLOPES,
+    ) -> StepSums:
+        """Add the gradients of a batch.
+
+        `extra_slopes`, one row per ray or none, are another loss' in the colours that the camera
+        sees over the background; they join the slopes of the batch's own loss.
+        """
+
+    def seen(self, batch: RayBatch, rule: StepRule) -> SeenRays:
+        """What the loss of a batch sees, before the cameras' gain."""
 
     def touched(self) -> Int[np.ndarray, " brick"]:
         """Bricks, but for the void, that have gradients."""
@@ -82,7 +106,12 @@ class CpuLearner:
         self._gradients = np.zeros((blocks, *state.grid.values.shape), np.float32)
         self._touched = np.zeros((blocks, len(state.grid.positions)), np.uint8)
 
-    def accumulate(self, batch: RayBatch, rule: StepRule) -> StepSums:
+    def accumulate(
+        self,
+        batch: RayBatch,
+        rule: StepRule,
+        extra_slopes: Float[np.ndarray, "any 3"] = NO_SLOPES,
+    ) -> StepSums:
         """See `Learner`."""
         state, blocks = self._state, len(self._gradients)
         light, gain = np.zeros((blocks, 9, 3)), np.zeros((blocks, *state.gain.shape))
@@ -91,10 +120,19 @@ class CpuLearner:
             state.grid.tables(), self._tables, state.light, state.gain, batch.poses,
             batch.cameras, batch.origins, batch.directions, batch.offsets, batch.targets,
             batch.mattes, batch.colour_weights, batch.matte_weights * rule.matte_weight,
-            batch.backgrounds, rule.step_m, rule.stop, rule.entropy_weight, self._gradients,
-            self._touched, light, gain, losses,
+            batch.backgrounds, extra_slopes, rule.step_m, rule.stop, rule.entropy_weight,
+            self._gradients, self._touched, light, gain, losses,
         )  # fmt: skip
         return StepSums(losses.sum(0), light.sum(0), gain.sum(0))
+
+    def seen(self, batch: RayBatch, rule: StepRule) -> SeenRays:
+        """See `Learner`."""
+        seen = np.empty((len(batch.poses), 4))
+        see_rays(
+            self._state.grid.tables(), self._tables, self._state.light, batch.poses, batch.origins,
+            batch.directions, batch.offsets, rule.step_m, rule.stop, seen,
+        )  # fmt: skip
+        return seen
 
     def touched(self) -> Int[np.ndarray, " brick"]:
         """See `Learner`."""

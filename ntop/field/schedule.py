@@ -11,7 +11,9 @@ class TrainingSettings:
     schedule: in a level, raw density is `sharpness` times as steep as the body's was at first, and
     the surface that much harder. A rate falls exponentially from the first to the second value.
     `light`: learn light that depends on the surface's direction in the world. `camera_colour`:
-    learn a gain and bias per camera.
+    learn a gain and bias per camera. `refine_cameras`, `refine_poses`: learn where cameras and
+    people stand (`refining`). `lpips_weight`: of a patch's perceptual distance, beside a ray's mean
+    loss (`perceptual`).
     """
 
     steps: int = 800
@@ -30,6 +32,9 @@ class TrainingSettings:
     light_rate: tuple[float, float] = (0.01, 0.001)
     light: bool = True
     camera_colour: bool = False
+    refine_cameras: bool = False
+    refine_poses: bool = False
+    lpips_weight: float = 0.0
     matte_weight: float = 1.0
     band_weights: tuple[float, float] = (0.2, 0.5)
     band_px: int = 2

@@ -17,11 +17,13 @@ from ntop.field.canonical import (
     occupied_cells,
     refined_grid,
 )
-from ntop.field.checkpoints import TrainingState
+from ntop.field.checkpoints import TrainingState, Twists
 from ntop.field.devices import kernel_device
 from ntop.field.kernels.tables import WarpTables
 from ntop.field.learners import CpuLearner, Learner, StepRule, StepSums
+from ntop.field.perceptual import PerceptualLoss
 from ntop.field.progress import GridProgress, psnr_db
+from ntop.field.refining import Refiner
 from ntop.field.schedule import TrainingSettings, decayed, level_at, march_step_m
 from ntop.field.views import RayBatch, RaySource
 from ntop.field.warp import occupied, octant_radius_m
@@ -35,9 +37,9 @@ BODY_VOXEL_M = 0.008  # of the body's own density, which others are anchored to
 
 
 def initial_state(
-    body: CanonicalBody, num_cameras: int, settings: TrainingSettings
+    body: CanonicalBody, num_cameras: int, settings: TrainingSettings, *, num_twists: int = 0
 ) -> TrainingState:
-    """Step 0: the body's own shape in grey, under even light."""
+    """Step 0: the body's own shape in grey, under even light; nothing has moved."""
     grid = initial_grid(
         body, voxel_m=settings.voxels_m[0], outer_m=settings.outer_m, inner_m=settings.inner_m
     )
@@ -48,6 +50,7 @@ def initial_state(
         occupancy=_occupancy(grid, settings),
         light=light,
         gain=np.zeros((num_cameras, 2, 3)),
+        num_twists=num_twists,
     )
 
 
@@ -61,9 +64,12 @@ class GridTrainer:
         *,
         settings: TrainingSettings,
         body: CanonicalBody,
+        refiner: Refiner | None = None,
+        perceptual: PerceptualLoss | None = None,
     ) -> None:
         """Go on from a state; `tables` are the poses' warps, whatever may be occupied."""
         self.state = state
+        self._refiner, self._perceptual = refiner, perceptual
         self._body_grid = initial_grid(
             body, voxel_m=BODY_VOXEL_M, outer_m=settings.outer_m, inner_m=settings.inner_m
         )
@@ -90,16 +96,21 @@ class GridTrainer:
         """One step: rays, gradients, update, and what is due at this step's number."""
         settings, state = self._settings, self.state
         generator = np.random.Generator(np.random.Philox(key=settings.seed, counter=state.step))
-        batch = source.draw(
-            settings.rays_per_batch, num_views=settings.views_per_batch, generator=generator
+        batch = self._placed(
+            source.draw(
+                settings.rays_per_batch, num_views=settings.views_per_batch, generator=generator
+            )
         )
         rule = self._rule()
         sums = self._learner.accumulate(batch, rule)
+        if self._perceptual is not None:
+            sums = self._with_patch(sums, self._perceptual, rule)
         active = self._learner.touched()
         if (state.step + 1) % settings.smooth_all_every == 0:
             active = np.arange(1, len(state.grid.positions))
         self._learner.learn(active, rule)
         self._learn_colours(sums)
+        twists = self._learned_twists(source, rule)
         step = state.step + 1
         person = max(float((batch.mattes > 0.5).sum()), 1.0)
         due = watched is not None and (step % settings.watch_every == 0 or step == settings.steps)
@@ -110,8 +121,32 @@ class GridTrainer:
             watched_psnr_db=self._watched_psnr(watched) if due else float("nan"),
             active_bricks=len(active),
         )
-        self.state = replace(state, step=step, curve=[*state.curve, progress])
+        self.state = replace(state, step=step, curve=[*state.curve, progress], twists=twists)
         self._reshape()
+
+    def _placed(self, batch: RayBatch) -> RayBatch:
+        """The rays from where their cameras stand by now."""
+        if self._refiner is None:
+            return batch
+        return self._refiner.moved(batch, self.state.twists)
+
+    def _learned_twists(self, source: RaySource, rule: StepRule) -> Twists:
+        state = self.state
+        if self._refiner is None:
+            return state.twists
+        return self._refiner.learn(
+            state.twists, source, self._learner, gain=state.gain, rule=rule, step=state.step
+        )
+
+    def _with_patch(self, sums: StepSums, loss: PerceptualLoss, rule: StepRule) -> StepSums:
+        """Add the gradients of the step's patch; the losses that are told stay those of rays."""
+        patch = loss.draw(self.state.step)
+        patch = replace(patch, rays=self._placed(patch.rays))
+        slopes = loss.slopes(patch, self._learner.seen(patch.rays, rule), gain=self.state.gain)
+        weight = self._settings.lpips_weight * self._settings.rays_per_batch
+        rule = replace(rule, entropy_weight=0.0)
+        more = self._learner.accumulate(patch.rays, rule, weight * slopes)
+        return StepSums(sums.losses, sums.light + more.light, sums.gain + more.gain)
 
     def _rule(self) -> StepRule:
         settings, state = self._settings, self.state
@@ -145,6 +180,7 @@ class GridTrainer:
 
     def _watched_psnr(self, batch: RayBatch) -> float:
         self.settle()
+        batch = self._placed(batch)
         return watched_psnr(self.state, self._tables, batch, settings=self._settings)
 
     def _reshape(self) -> None:

@@ -23,7 +23,8 @@ class TrainingViews:
     """Crops and where they come from. `boxes` are left, top, width, height in the camera's image.
 
     A crop is (height, width, 4): RGB and matte. `watched` views are never trained on: they say
-    when to stop.
+    when to stop. `camera_names` (action, view) and `pose_names` (action, frame) are the capture's
+    words for them; empty where views come from no capture.
     """
 
     cameras: tuple[Camera, ...]
@@ -33,6 +34,8 @@ class TrainingViews:
     pose_of_view: Int[np.ndarray, " view"]
     poses: BodyPose
     watched: Bool[np.ndarray, " view"]
+    camera_names: tuple[tuple[str, str], ...] = ()
+    pose_names: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class RaySource:
             cameras=cameras,
             origins=origins,
             directions=directions,
-            offsets=_spread(count, generator),
+            offsets=spread(count, generator),
             backgrounds=generator.random((count, 3), np.float32),
             targets=targets,
             mattes=mattes,
@@ -123,7 +126,7 @@ class RaySource:
         )
 
 
-def _spread(count: int, generator: np.random.Generator) -> Float[np.ndarray, " ray"]:
+def spread(count: int, generator: np.random.Generator) -> Float[np.ndarray, " ray"]:
     """One offset per ray in [0, 1): the golden-ratio sequence from a random start.
 
     Neighbouring rays get well-spread phases; a draw per sample would cost half an order of

@@ -9,7 +9,7 @@ STAGES = (
     (2, "mask", 1),
     (3, "fit", 2),
     (4, "train", 5),
-    (5, "render", 7),
+    (5, "render", 8),
     (6, "annotate", 1),
     (7, "assemble", 1),
     (8, "evaluate", 3),

@@ -4,7 +4,13 @@
 |---|---|
 | `avatar.safetensors`, `avatar.json` | the field and its header (ntop.field.interface) |
 | `curve.parquet` (schema CURVE) | loss and PSNR per step, watched frames now and then |
+| `refinement.parquet` (schema REFINEMENT) | where cameras and people were moved, if refined |
 | `provenance.json` | configuration, code and inputs |
+
+`refinement.parquet` is there with `refine_cameras` or `refine_poses`. It has a row per camera
+(`action`, `view`; `frame` -1) and one per frame (`view` empty): `rotation_rad`, a turn (axis-angle)
+about the camera's centre or the person's pelvis, and `translation_m`, both in world axes; zero for
+what is not refined and for frames that only say when to stop.
 
 A stopped training continues at its last checkpoint in the work folder, with the same result.
 """
@@ -17,6 +23,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import assert_never
 
+import numpy as np
 import torch
 
 from ntop.body.model import BodyModel, load_body_model
@@ -27,7 +34,9 @@ from ntop.field.humannerf.device import compute_device, device_words
 from ntop.field.humannerf.settings import HumanNerfSettings
 from ntop.field.humannerf.training import train_humannerf
 from ntop.field.interface import AnyAvatar, save_avatar
+from ntop.field.patches import Perceptual
 from ntop.field.progress import Progress, TrainingStoppedError
+from ntop.field.refining import SHIFT, TURN, Corrections
 from ntop.field.schedule import TrainingSettings
 from ntop.field.training import train
 from ntop.field.views import TrainingViews
@@ -37,7 +46,7 @@ from ntop.storage import schemas
 from ntop.storage.atomic import atomic_folder, write_bytes
 from ntop.storage.files import check_files, record_files
 from ntop.storage.provenance import code_sha256, file_sha256, provenance, write_provenance
-from ntop.storage.tables import write_table
+from ntop.storage.tables import Row, write_table
 from ntop.storage.work import EXIT_TERMINATED, clear_work, termination_flag, work_folder
 
 STAGE = "train"
@@ -68,8 +77,10 @@ def main(
     check_files(capture, cameras.parent, masks.parent, bodies.parent)
     tables = Tables(capture / "frames.parquet", cameras, masks, bodies)
     inputs = {name: file_sha256(path) for name, path in asdict(tables).items()}
-    if config.field == "humannerf" and config.humannerf.lpips_weights:
-        inputs["lpips_weights"] = file_sha256(Path(config.humannerf.lpips_weights))
+    perceptual = None
+    if config.perceptual_path:
+        perceptual = load_lpips(config.perceptual_path, device=compute_device())
+        inputs["lpips_weights"] = file_sha256(config.perceptual_path)
     values = config.model_dump(mode="json")
     model = load_body_model(config.body_path)
     recipe = {"config": values, "inputs": inputs, "code": code_sha256()}
@@ -82,10 +93,11 @@ def main(
             margin_m=config.reach_m,
         )
         try:
-            avatar, curve = train_field(
+            avatar, curve, corrections = train_field(
                 config,
                 views,
                 model,
+                perceptual=perceptual,
                 checkpoint_path=content / CHECKPOINT_NAME,
                 stop_requested=terminated,
             )
@@ -96,6 +108,9 @@ def main(
             save_avatar(avatar, folder, write=write_bytes)
             rows = [{name: getattr(line, name) for name in schemas.CURVE.names} for line in curve]
             write_table(rows, schema=schemas.CURVE, path=folder / "curve.parquet")
+            if corrections is not None:
+                moves = _refinement_rows(corrections, views)
+                write_table(moves, schema=schemas.REFINEMENT, path=folder / "refinement.parquet")
             record = provenance(stage=STAGE, version=VERSIONS[STAGE], config=values, inputs=inputs)
             write_provenance(record, folder=folder)
             record_files(folder)
@@ -107,35 +122,49 @@ def train_field(
     views: TrainingViews,
     model: BodyModel,
     *,
+    perceptual: Perceptual | None,
     checkpoint_path: Path,
     stop_requested: Callable[[], bool],
-) -> tuple[AnyAvatar, Sequence[Progress]]:
-    """Train the configured kind of avatar.
+) -> tuple[AnyAvatar, Sequence[Progress], Corrections | None]:
+    """Train the configured kind of avatar; corrections only where it refines any.
 
     Raises:
         TrainingStoppedError: `stop_requested` became true; the state is saved.
     """
     betas = tuple(float(value) for value in views.poses.betas[0])
-    piece = {"checkpoint_path": checkpoint_path, "stop_requested": stop_requested}
+    piece = {
+        "perceptual": perceptual,
+        "checkpoint_path": checkpoint_path,
+        "stop_requested": stop_requested,
+    }
     match config.field:
         case "grid":
             sys.stderr.write(f"train: {kernel_words()}\n")
             settings = training_settings(config)
-            return train(
-                views, model, betas, settings=settings, on_step=_Reporter(settings.steps), **piece
+            found: list[Corrections] = []
+            avatar, curve = train(
+                views,
+                model,
+                betas,
+                settings=settings,
+                on_step=_Reporter(settings.steps),
+                on_refined=found.append,
+                **piece,
             )
+            if found:
+                sys.stderr.write(f"train: moved {_refinement_words(found[0])}\n")
+            return avatar, curve, found[0] if found else None
         case "humannerf":
             sys.stderr.write(f"train: {device_words()}\n")
-            weights = config.humannerf.lpips_weights
-            return train_humannerf(
+            avatar, curve = train_humannerf(
                 views,
                 model,
                 betas,
                 settings=humannerf_settings(config),
-                perceptual=load_lpips(Path(weights), device=compute_device()) if weights else None,
                 on_step=_Reporter(config.humannerf.steps),
                 **piece,
             )
+            return avatar, curve, None
         case _:
             assert_never(config.field)
 
@@ -169,7 +198,33 @@ def training_settings(config: TrainConfig) -> TrainingSettings:
         band_weights=(COLOUR_EDGE_WEIGHT, config.matte_edge_weight),
         body_weight=config.body_weight,
         camera_colour=config.camera_colour,
+        refine_cameras=config.refine_cameras,
+        refine_poses=config.refine_poses,
+        lpips_weight=config.lpips_weight,
     )
+
+
+def _refinement_rows(corrections: Corrections, views: TrainingViews) -> list[Row]:
+    """Rows of schema REFINEMENT: cameras, then frames."""
+    names = [(*name, -1) for name in views.camera_names]
+    names += [(action, "", frame) for action, frame in views.pose_names]
+    moves = np.concatenate([corrections.cameras, corrections.poses]).tolist()
+    return [
+        dict(zip(schemas.REFINEMENT.names, (*name, move[:3], move[3:]), strict=True))
+        for name, move in zip(names, moves, strict=True)
+    ]
+
+
+def _refinement_words(corrections: Corrections) -> str:
+    """Root mean squares and the largest, for the job's log."""
+    words = []
+    for name, moves in (("cameras", corrections.cameras), ("people", corrections.poses)):
+        turns, shifts = (1000 * np.linalg.norm(moves[:, part], axis=1) for part in (TURN, SHIFT))
+        words.append(
+            f"{name} by {np.sqrt((shifts**2).mean()):.1f} mm (at most {shifts.max():.1f}) and "
+            f"{np.sqrt((turns**2).mean()):.2f} mrad (at most {turns.max():.2f})"
+        )
+    return ", ".join(words)
 
 
 class _Reporter:

@@ -105,6 +105,18 @@ CURVE = pa.schema(
     ]
 )
 
+# Where training moved a camera (`frame` -1: all of the action's) or, with an empty `view`, the
+# person in one frame: world axes, a turn about the camera's centre or the pelvis, then the shift.
+REFINEMENT = pa.schema(
+    [
+        ("action", STRING),
+        ("view", STRING),
+        ("frame", INT32),
+        ("rotation_rad", vector(3)),
+        ("translation_m", vector(3)),
+    ]
+)
+
 # What completes `camera_model`, `focal_px`, `cx_px`, `cy_px`, `max_theta_rad` (decision 0017): the
 # vertical focal length, and k1..k4 of a Kannala-Brandt lens (empty for the others). They came
 # later: a table without them reads as null, which means square pixels and no distortion.

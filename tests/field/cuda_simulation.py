@@ -28,6 +28,10 @@ def main(given: Path, found: Path) -> None:
     results["sums"] = [learner.accumulate(batch, rule) for batch in batches]
     results["gradients"] = learner._sums.copy_to_host()
     results["touched"] = learner.touched()
+    results["seen"] = learner.seen(batches[0], rule)
+    extra = GpuLearner(state, tables, anchors)
+    results["extra_gain"] = extra.accumulate(batches[0], rule, cases["slopes"]).gain
+    results["extra_gradients"] = extra._sums.copy_to_host()
     results["broken"] = refusal(GpuLearner(state, tables, anchors), batches[0], rule)
     shuffled = GpuLearner(state, tables, anchors)
     order = np.random.default_rng(0).permutation(len(batches[0].poses))

@@ -95,6 +95,11 @@ def batch_of(seed):
     )  # fmt: skip
 
 
+def slopes_of(batch):
+    """Another loss' slopes in what is seen."""
+    return np.random.default_rng(8).normal(size=(len(batch.poses), 3))
+
+
 def learn_case():
     _, one, two = warps()
     gain = 0.1 * np.random.default_rng(4).normal(size=(3, 2, 3))
@@ -108,6 +113,7 @@ def learn_case():
 def run(folder, variables):
     """What `tests.field.cuda_simulation` computes of the cases, and the cases."""
     cases = {"march": march_case(), "view": view_case(), "learn": learn_case()}
+    cases["slopes"] = slopes_of(cases["learn"][3][0])
     (folder / "cases").write_bytes(pickle.dumps(cases))
     subprocess.run(
         [sys.executable, "-m", "tests.field.cuda_simulation", folder / "cases", folder / "found"],
@@ -171,6 +177,29 @@ def test_sums_of_a_batch_equal_the_cpu_kernels(computed):
     got = found["gradients"] / found["units"]
     assert np.abs(got - expected).max() < 1e-6 * np.abs(expected).max()
     assert (found["touched"] == learner.touched()).all()
+
+
+def test_what_rays_see_equals_the_cpu_kernels(computed):
+    cases, found = computed
+    state, tables, anchors, batches, rule = cases["learn"]
+    expected = CpuLearner(state, tables, anchors, blocks=1).seen(batches[0], rule)
+    assert (expected[:, 3] > 0.5).mean() > 0.2
+    assert np.abs(found["seen"] - expected).max() < 1e-6
+
+
+def test_gradients_with_extra_slopes_equal_the_cpu_kernels(computed):
+    cases, found = computed
+    state, tables, anchors, batches, rule = cases["learn"]
+    learner = CpuLearner(state, tables, anchors, blocks=1)
+    sums = learner.accumulate(batches[0], rule, slopes_of(batches[0]))
+    expected = learner._gradients[0]
+    expected[:64] = 0
+    got = found["extra_gradients"] / found["units"]
+    assert np.abs(got - expected).max() < 1e-6 * np.abs(expected).max()
+    assert np.abs(found["extra_gain"] - sums.gain).max() < 1e-6 * np.abs(sums.gain).max()
+    without = CpuLearner(state, tables, anchors, blocks=1)
+    without.accumulate(batches[0], rule)
+    assert np.abs(got - without._gradients[0]).max() > 0.1 * np.abs(expected).max()
 
 
 def test_gradients_equal_autograd_of_the_twin(computed):

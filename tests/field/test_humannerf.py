@@ -15,10 +15,6 @@ import torch
 from ntop import cli
 from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
-from ntop.captures.training_views import Tables, training_views
-from ntop.config.sections import CaptureConfig
-from ntop.config.sources import StudioSource
-from ntop.config.tables import Sequence
 from ntop.conventions import DataError
 from ntop.field.avatar import load_avatar as load_grid
 from ntop.field.humannerf.field import ActorField, warped
@@ -36,7 +32,7 @@ from ntop.field.humannerf.training import train_humannerf
 from ntop.field.interface import load_avatar, pose_avatar, render_view, save_avatar
 from ntop.field.progress import TrainingStoppedError
 from ntop.metrics.images import Cutout, psnr_box_db, psnr_db, tight_window
-from ntop.stages import s1_capture
+from tests.captures.tiny_studio import tiny_capture, tiny_views
 
 SIZES = Architecture(
     canonical_width=48, canonical_depth=4, canonical_bands=6, non_rigid_width=16,
@@ -58,29 +54,12 @@ def model():
 def capture(tmp_path_factory):
     """Four cameras of 96 px around one actor in two poses, everything given."""
     out = tmp_path_factory.mktemp("capture") / "plain"
-    source = StudioSource(
-        reader="studio", provides=("masks", "keypoints2d", "bodies"), num_cameras=4,
-        image_size_px=96, supersampling=2, seed=3,
-    )  # fmt: skip
-    sequence = Sequence(
-        source="studio", actor="plain", action="range", first=0, last=20, step=20, use="train",
-        motion="authored:range",
-    )  # fmt: skip
-    config = CaptureConfig(source_section=source, sequences=(sequence,))
-    s1_capture.main(config, "studio", "plain", packages=out.parent, out=out)
-    return out
-
-
-def tables(folder):
-    names = ("frames", "cameras", "masks", "bodies")
-    return Tables(*(folder / f"{name}.parquet" for name in names))
+    return tiny_capture(out, last=20, num_cameras=4, image_size_px=96)
 
 
 @pytest.fixture(scope="module")
 def views(capture, model):
-    found = training_views(
-        tables(capture), model, held_out_views=(), max_person_px=500, margin_m=0.05
-    )
+    found = tiny_views(capture, model)
     return replace(found, watched=np.arange(len(found.crops)) == 0)
 
 

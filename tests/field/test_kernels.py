@@ -11,6 +11,7 @@ from ntop.field import twin
 from ntop.field.kernels.adjoint import train_rays
 from ntop.field.kernels.march import RAYS_PER_CHUNK, render_rays
 from ntop.field.kernels.tables import EMPTY_DENSITY
+from ntop.field.learners import NO_SLOPES
 from ntop.field.marching import EVERYWHERE
 from ntop.field.packing import packed_density, packed_sheets
 from tests.field.conftest import ball_grid, random_rays
@@ -89,7 +90,7 @@ def test_gradients_equal_autograd_of_the_twin(full_warp):
     train_rays(
         grid.tables(), full_warp.tables, light, gain, np.zeros(count, np.int64),
         np.zeros(count, np.int64), origins, directions, offsets, targets, mattes, weights[0],
-        weights[1], backgrounds, STEP_M, 0.0, 0.03, gradients, touched, light_gradients,
+        weights[1], backgrounds, NO_SLOPES, STEP_M, 0.0, 0.03, gradients, touched, light_gradients,
         gain_gradients, np.zeros((1, 3)),
     )  # fmt: skip
 

@@ -8,16 +8,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from ntop.body.model import EMBEDDED_BODY_PATH
-from ntop.config.sections import CaptureConfig, FitConfig, MaskConfig
-from ntop.config.sources import StudioSource
-from ntop.config.tables import Sequence
+from ntop.config.sections import FitConfig, MaskConfig
 from ntop.conventions import DataError
 from ntop.metrics.images import mask_iou
-from ntop.stages import s1_capture, s2_mask, s3_fit
+from ntop.stages import s2_mask, s3_fit
 from ntop.storage import schemas
 from ntop.storage.files import record_files
 from ntop.storage.images import read_matte, write_matte
 from ntop.storage.tables import read_table, write_table
+from tests.captures.tiny_studio import tiny_capture
 
 BACKGROUND = MaskConfig(method="background", provides=("keypoints2d",))
 STILL_CAMERAS = FitConfig(refine_cameras=False)
@@ -27,17 +26,7 @@ STILL_CAMERAS = FitConfig(refine_cameras=False)
 def capture(tmp_path_factory):
     """Five cameras, four frames of 160 px, everything given, 0.3 px of keypoint noise."""
     out = tmp_path_factory.mktemp("capture") / "plain"
-    source = StudioSource(
-        reader="studio", provides=("masks", "keypoints2d", "bodies"), num_cameras=5,
-        image_size_px=160, supersampling=2, keypoint_noise_px=0.3, seed=3,
-    )  # fmt: skip
-    sequence = Sequence(
-        source="studio", actor="plain", action="range", first=0, last=60, step=20, use="train",
-        motion="authored:range",
-    )  # fmt: skip
-    config = CaptureConfig(source_section=source, sequences=(sequence,))
-    s1_capture.main(config, "studio", "plain", packages=out.parent, out=out)
-    return out
+    return tiny_capture(out, last=60, num_cameras=5, image_size_px=160, keypoint_noise_px=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -179,9 +179,8 @@ def mask_packages(wildcards):
 def perceptual_package(wildcards):
     """The package with the perceptual loss's weights, where the actor's avatar asks for them."""
     section = TrainConfig(**stage_section(CONFIG, "train", source=wildcards.source))
-    path = Path(section.humannerf.lpips_weights)
-    fetched = section.field == "humannerf" and path.is_relative_to(PACKAGES)
-    return [str(path.parent)] if fetched else []
+    path = section.perceptual_path
+    return [str(path.parent)] if path and path.is_relative_to(PACKAGES) else []
 
 
 def render_packages(wildcards):

@@ -1,17 +1,8 @@
 """What the twin's training is told."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from jaxtyping import Float
-from torch import Tensor
-
 from ntop.field.humannerf.networks import Architecture
-
-Perceptual = Callable[
-    [Float[Tensor, "image row column 3"], Float[Tensor, "image row column 3"]],
-    Float[Tensor, " image"],
-]
 
 
 @dataclass(frozen=True)

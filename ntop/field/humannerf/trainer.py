@@ -25,9 +25,9 @@ from ntop.field.humannerf.networks import (
     hann_windows,
     new_networks,
 )
-from ntop.field.humannerf.patches import Patches, PatchSource
-from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual
+from ntop.field.humannerf.settings import HumanNerfSettings
 from ntop.field.humannerf.skeleton import canonical_skeleton, gaussian_bones, posed_skeleton
+from ntop.field.patches import Patches, PatchSource, Perceptual
 from ntop.field.progress import Progress, psnr_db
 from ntop.field.views import TrainingViews
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from ntop.body.model import BodyModel
 from ntop.field.humannerf.avatar import HumanNerfAvatar
-from ntop.field.humannerf.settings import HumanNerfSettings, Perceptual
+from ntop.field.humannerf.settings import HumanNerfSettings
 from ntop.field.humannerf.trainer import HumanNerfTrainer
+from ntop.field.patches import Perceptual
 from ntop.field.progress import Progress, TrainingStoppedError
 from ntop.field.views import TrainingViews
 

@@ -29,6 +29,7 @@ from ntop.field.kernels.tables import (
 MAX_SAMPLES = 512  # occupied samples kept per ray; at 4 mm that is 2 m of solid body
 ROBUST_WIDTH = 0.1  # colour errors beyond this count linearly (Charbonnier)
 MIN_SHADE = 0.02  # as in `shade`
+RAYS_PER_CHUNK = 128
 FAINT = 1e-3  # weight up to which a sample says nothing about the light
 
 
@@ -73,6 +74,35 @@ def albedo(grid, rows, weights):
         sigmoid(interpolate(grid, 2, rows, weights)),
         sigmoid(interpolate(grid, 3, rows, weights)),
     )
+
+
+@device
+def seen_ray(grid, warp, light, pose, ray, far, step, offset, first, stop, rows, weights):
+    """Walk a ray from its sample `first` on and keep nothing.
+
+    Returns red, green, blue (premultiplied), transmittance, and the number of samples.
+    """
+    sample, samples = first, 0
+    thickness, transmittance = 0.0, 1.0
+    red = green = blue = 0.0
+    while transmittance >= stop and samples < MAX_SAMPLES:
+        sample, cell, fx, fy, fz, raw, sheet = next_dense(
+            grid, warp, pose, ray, far, step, offset, sample, rows, weights
+        )
+        if cell < 0:
+            break
+        tau = DENSITY_SCALE * softplus(raw) * step
+        weight = transmittance * -math.expm1(-tau)
+        thickness += tau
+        transmittance = math.exp(-thickness)
+        surface = albedo(grid, rows[sheet], weights[sheet])
+        nx, ny, nz = surface_normal(warp, cell, sheet, fx, fy, fz)
+        red += weight * surface[0] * shade(light, 0, nx, ny, nz)
+        green += weight * surface[1] * shade(light, 1, nx, ny, nz)
+        blue += weight * surface[2] * shade(light, 2, nx, ny, nz)
+        samples += 1
+        sample += 1
+    return red, green, blue, transmittance, samples
 
 
 @device
@@ -136,10 +166,27 @@ def add_light_slopes(light, surface, normal, weight, slopes, light_slopes):
 
 
 @kernel
+def see_rays(grid, warp, light, poses, origins, directions, offsets, step, stop, seen):
+    """What `train_rays` sees of each ray: `seen` (rays, 4), premultiplied colour and opacity."""
+    count = directions.shape[0]
+    for chunk in numba.prange((count + RAYS_PER_CHUNK - 1) // RAYS_PER_CHUNK):
+        rows = np.empty((2, 8), np.int64)
+        weights = np.empty((2, 8), grid.values.dtype)
+        for r in range(chunk * RAYS_PER_CHUNK, min(count, (chunk + 1) * RAYS_PER_CHUNK)):
+            ray, near, far = start_ray(warp, poses[r], origins[r], directions[r])
+            first = max(0, int(math.ceil(near / step - offsets[r])))
+            red, green, blue, transmittance, _ = seen_ray(
+                grid, warp, light, poses[r], ray, far, step, offsets[r], first, stop, rows, weights
+            )
+            seen[r, 0], seen[r, 1], seen[r, 2] = red, green, blue
+            seen[r, 3] = 1 - transmittance
+
+
+@kernel
 def train_rays(
     grid, warp, light, camera_gain, poses, cameras, origins, directions, offsets, targets, mattes,
-    colour_weights, matte_weights, backgrounds, step, stop, entropy_weight, gradients, touched,
-    light_gradients, gain_gradients, losses,
+    colour_weights, matte_weights, backgrounds, extra_slopes, step, stop, entropy_weight, gradients,
+    touched, light_gradients, gain_gradients, losses,
 ):  # fmt: skip
     """Add the gradients of the rays' losses to the blocks' buffers.
 
@@ -153,6 +200,7 @@ def train_rays(
         targets: (rays, 3) photograph's colour. mattes: (rays,) its opacity.
         colour_weights, matte_weights: (rays,). backgrounds: (rays, 3) random colours, laid behind
             both the field and the photograph's person, so that the field cannot imitate the scene.
+        extra_slopes: (rays, 3) of another loss in the colour over the background, or (0, 3).
         entropy_weight: pushes the opacity of rays away from one half.
         gradients: (blocks, rows, 4). touched: (blocks, bricks) uint8.
         light_gradients: (blocks, 9, 3). gain_gradients: (blocks, cameras, 2, 3).
@@ -215,6 +263,8 @@ def train_rays(
                 if matte > 0.5:
                     losses[block, 1] += error * error
                 slope *= colour_weights[r]
+                if extra_slopes.shape[0] > 0:
+                    slope += extra_slopes[r, channel]
                 scale = math.exp(gain[0, channel])
                 gain_gradients[block, camera, 0, channel] += slope * colour[channel] * scale
                 gain_gradients[block, camera, 1, channel] += slope * opacity

@@ -15,18 +15,17 @@ import numba.core.config
 from numba import cuda, float32, float64, int64
 
 from ntop.field.kernels.adjoint import (
-    MAX_SAMPLES,
     add_light_slopes,
     albedo,
     channel_loss,
     next_dense,
     sample_slopes,
+    seen_ray,
 )
 from ntop.field.kernels.learn import adam_value, add_priors
 from ntop.field.kernels.march import march_ray
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
-    shade,
     sigmoid,
     softplus,
     start_ray,
@@ -73,10 +72,27 @@ def add_exactly(sums, index, value, broken):
 
 
 @cuda.jit(cache=True)
+def see_rays(grid, warp, light, poses, origins, directions, offsets, step, stop, seen):
+    """As `adjoint.see_rays`."""
+    r = cuda.grid(1)
+    if r >= directions.shape[0]:
+        return
+    rows = cuda.local.array((2, 8), int64)
+    weights = cuda.local.array((2, 8), float32)
+    ray, near, far = start_ray(warp, poses[r], origins[r], directions[r])
+    first = max(0, int(math.ceil(near / step - offsets[r])))
+    red, green, blue, transmittance, _ = seen_ray(
+        grid, warp, light, poses[r], ray, far, step, offsets[r], first, stop, rows, weights
+    )
+    seen[r, 0], seen[r, 1], seen[r, 2] = red, green, blue
+    seen[r, 3] = 1 - transmittance
+
+
+@cuda.jit(cache=True)
 def train_rays(
     grid, warp, light, camera_gain, poses, cameras, origins, directions, offsets, targets, mattes,
-    colour_weights, matte_weights, backgrounds, step, stop, entropy_weight, gradients, touched,
-    light_gradients, gain_gradients, losses, broken,
+    colour_weights, matte_weights, backgrounds, extra_slopes, step, stop, entropy_weight, gradients,
+    touched, light_gradients, gain_gradients, losses, broken,
 ):  # fmt: skip
     """As `adjoint.train_rays`, without blocks.
 
@@ -98,26 +114,9 @@ def train_rays(
     first = max(0, int(math.ceil(near / step - offsets[r])))
 
     # the first walk: what the ray sees
-    sample, samples = first, 0
-    thickness, transmittance = 0.0, 1.0
-    red = green = blue = 0.0
-    while transmittance >= stop and samples < MAX_SAMPLES:
-        sample, cell, fx, fy, fz, raw, sheet = next_dense(
-            grid, warp, pose, ray, far, step, offsets[r], sample, rows, weights
-        )
-        if cell < 0:
-            break
-        tau = DENSITY_SCALE * softplus(raw) * step
-        weight = transmittance * -math.expm1(-tau)
-        thickness += tau
-        transmittance = math.exp(-thickness)
-        surface = albedo(grid, rows[sheet], weights[sheet])
-        nx, ny, nz = surface_normal(warp, cell, sheet, fx, fy, fz)
-        red += weight * surface[0] * shade(light, 0, nx, ny, nz)
-        green += weight * surface[1] * shade(light, 1, nx, ny, nz)
-        blue += weight * surface[2] * shade(light, 2, nx, ny, nz)
-        samples += 1
-        sample += 1
+    red, green, blue, transmittance, samples = seen_ray(
+        grid, warp, light, pose, ray, far, step, offsets[r], first, stop, rows, weights
+    )
 
     # loss and its derivatives
     opacity, matte = 1 - transmittance, mattes[r]
@@ -135,6 +134,8 @@ def train_rays(
         if matte > 0.5:
             add_exactly(losses, 1, error * error, broken)
         slope *= colour_weights[r]
+        if extra_slopes.shape[0] > 0:
+            slope += extra_slopes[r, channel]
         scale = math.exp(gain[0, channel])
         add_exactly(gain_gradients, (camera, 0, channel), slope * colour[channel] * scale, broken)
         add_exactly(gain_gradients, (camera, 1, channel), slope * opacity, broken)

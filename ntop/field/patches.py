@@ -1,5 +1,6 @@
 """Training patches: small squares of one photograph, mostly on the person, over a random colour."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,11 @@ from jaxtyping import Float, Int
 
 from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE, DataError
 from ntop.field.views import TrainingViews
+
+Perceptual = Callable[
+    [Float[torch.Tensor, "image row column 3"], Float[torch.Tensor, "image row column 3"]],
+    Float[torch.Tensor, " image"],
+]
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,8 @@ class PatchSource:
         if not self.chosen:
             raise DataError(
                 f"no picture shows the person in a box of at least {side_px} x {side_px} px; "
-                "lower train.humannerf.patch_px or raise train.max_person_px"
+                "raise train.max_person_px, or lower train.humannerf.patch_px (field humannerf) or "
+                "set train.lpips_weight to 0 (field grid)"
             )
 
     def draw(self, count: int, *, generator: np.random.Generator) -> Patches:

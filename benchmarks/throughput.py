@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 
 from benchmarks.environment import ROOT, write_result
@@ -34,7 +35,7 @@ from ntop.field.culling import body_pixels
 from ntop.field.interface import pose_avatar, render_view
 from ntop.field.rendering import PRESETS, Rendering
 from ntop.geometry.cameras import Camera
-from ntop.geometry.rigs import top_view_cameras
+from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from ntop.stages import s5_render, s6_annotate
 from ntop.storage.images import encode_depth, encode_parts, encode_rgba
@@ -53,7 +54,8 @@ class Case:
     work: str = "labels"
     threads: int = 1
     size_px: int = 1000
-    height_m: float = 1.2
+    height_m: float = 1.4  # the demo's studio actor is 200 pixels large on average
+    quality: str = "default"
     views: int = len(VIEWS)
     sets: int = 3
 
@@ -69,6 +71,7 @@ class Speed:
     peak_mb: float
 
 
+WORKS = ("render", "files", "labels")
 # the stages render whole sets, so fewer views are rendered without files
 WORK_OF = {"size_px": "labels", "height_m": "labels", "views": "render", "sets": "labels"}
 PARTS = (
@@ -84,14 +87,17 @@ def main(results: Path | None) -> None:
     values = {
         "subjects": names,
         "cores": parallel(base, results),
-        "parts": [parts_ms(subject) for subject in subjects(results)],
+        "person_px": {
+            subject.name: person_px(subject, base.height_m) for subject in subjects(results)
+        },
+        "parts": [parts_ms(subject, base.height_m) for subject in subjects(results)],
         "axes": {
             axis: [
                 run(replace(base, work=WORK_OF[axis], **{axis: value}), results) for value in values
             ]
             for axis, values in {
                 "size_px": (250, 500, 1000, 2000),
-                "height_m": (1.0, 1.2, 1.6, 2.4),
+                "height_m": (1.0, 1.4, 2.0, 2.8),
                 "views": (1, 3, 9),
                 "sets": (1, 3, 9),
             }.items()
@@ -104,9 +110,9 @@ def main(results: Path | None) -> None:
 def parallel(base: Case, results: Path | None) -> list[dict]:
     """One core, one process with two threads, and two processes on a core each."""
     rows = []
-    for work in ("render", "files", "labels"):
+    for work, quality in (*((work, "default") for work in WORKS), ("labels", "draft")):
         for threads, processes in ((1, 1), (2, 1), (1, 2)):
-            case = replace(base, work=work, threads=threads)
+            case = replace(base, work=work, quality=quality, threads=threads)
             row = run(case, results, processes=processes)
             rows.append(row)
             sys.stderr.write(f"{row}\n")
@@ -146,6 +152,7 @@ def work(case: Case, results: Path | None, *, meeting: Path, processes: int) -> 
     config = RenderConfig(
         rigs={RIG: RigConfig(height_above_pelvis_m=case.height_m, ring_radius_m=1.0)},
         image=ImageConfig(width_px=case.size_px, height_px=case.size_px),
+        quality=case.quality,
     )
     studio = s5_render.Studio(
         avatar=subject.avatar,
@@ -214,11 +221,25 @@ def cameras_above(studio: s5_render.Studio, pose: BodyPose) -> dict[str, Camera]
     return top_view_cameras(studio.rig, pelvis)
 
 
-def parts_ms(subject: Subject) -> dict:
-    """Milliseconds of one core per view, by what is done; a pose's are shared by its nine views."""
-    config = RenderConfig(rigs={RIG: RigConfig(height_above_pelvis_m=1.2, ring_radius_m=1.0)})
+def seen_from(subject: Subject, height_m: float) -> tuple[Rig, dict[str, Camera]]:
+    """The rig of this height, and its cameras over a subject."""
+    config = RenderConfig(rigs={RIG: RigConfig(height_above_pelvis_m=height_m, ring_radius_m=1.0)})
     rig = s5_render.rig_of(config, RIG)
-    cameras = top_view_cameras(rig, torch.from_numpy(subject.joints_world()[0]))
+    return rig, top_view_cameras(rig, torch.from_numpy(subject.joints_world()[0]))
+
+
+def person_px(subject: Subject, height_m: float) -> float:
+    """The larger side of the person's box, mean over the nine views."""
+    posed, sides = subject.posed(PRESETS["draft"]), []
+    for camera in seen_from(subject, height_m)[1].values():
+        mask = render_view(posed, camera, settings=PRESETS["draft"]).alpha >= 0.5
+        sides.append(max(np.ptp(places) + 1 for places in np.nonzero(mask)))
+    return round(float(np.mean(sides)), 1)
+
+
+def parts_ms(subject: Subject, height_m: float) -> dict:
+    """Milliseconds of one core per view, by what is done; a pose's are shared by its nine views."""
+    rig, cameras = seen_from(subject, height_m)
     body = body_columns(subject.model, subject.pose)
     settings, spent = PRESETS["default"], dict.fromkeys(PARTS, 0.0)
 

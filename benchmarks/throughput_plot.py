@@ -28,10 +28,15 @@ def plot(values: dict) -> None:
         axis.set_xlabel(label)
         axis.set_ylim(bottom=0)
     axes[0].set_ylabel("ms of a core per view")
-    whole = [row for row in values["cores"] if row["work"] == "labels"]
-    rows = [row for row in whole if row["threads"] == 1]
-    cores = [row["processes"] for row in rows]
-    axes[-1].plot(cores, [row["views_per_s"] for row in rows], "o-", color=BLUE)
+    for quality, mark in (("default", "o-"), ("draft", "o--")):
+        rows = [
+            row
+            for row in values["cores"]
+            if (row["work"], row["quality"], row["threads"]) == ("labels", quality, 1)
+        ]
+        cores = [row["processes"] for row in rows]
+        axes[-1].plot(cores, [row["views_per_s"] for row in rows], mark, color=BLUE, label=quality)
+    axes[-1].legend(fontsize=7, frameon=False)
     axes[-1].set_xlabel("cores, a job on each")
     axes[-1].set_ylabel("views/s, with files and labels")
     axes[-1].set_xticks([1, 2])

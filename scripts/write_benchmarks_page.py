@@ -121,22 +121,25 @@ def skipping_lines(values: dict) -> list[str]:
 
 def throughput_lines(values: dict) -> list[str]:
     """Views per second by work and cores, what a view is made of, and the axes."""
+    sizes = ", ".join(f"{name} {size:.0f}" for name, size in values["person_px"].items())
     lines = [
         "",
         "## Views per second",
         "",
-        "The render stage's own code on sets of nine views of 1000 x 1000 pixels, 1.2 m above the "
-        "pelvis, ring of 1 m (a person of about 200 pixels); `files`: RGBA, depth and parts "
-        f"written; `labels`: read again and annotated as well. {where(values)}",
+        "The render stage's own code on sets of nine views of 1000 x 1000 pixels, "
+        f"{values['cores'][0]['height_m']:g} m above the pelvis, ring of 1 m; `files`: RGBA, depth "
+        "and parts written; `labels`: read again and annotated as well. The larger side of the "
+        f"person's box, mean of the nine views: {sizes} pixels. {where(values)}",
         "",
         "![Views per second](../benchmarks/results/throughput.png)",
         "",
-        "| subject | work | one core | two threads | two jobs | gain of two jobs | MB per job |",
-        "|---|---|---:|---:|---:|---:|---:|",
+        "| subject | work | preset | one core | two threads | two jobs | gain of two jobs "
+        "| MB per job |",
+        "|---|---|---|---:|---:|---:|---:|---:|",
     ]
     for one, two, jobs in zip(*(values["cores"][k::3] for k in range(3)), strict=True):
         lines.append(
-            f"| {one['subject']} | {one['work']} | {one['views_per_s']:.1f} | "
+            f"| {one['subject']} | {one['work']} | {one['quality']} | {one['views_per_s']:.1f} | "
             f"{two['views_per_s']:.1f} | {jobs['views_per_s']:.1f} | "
             f"{jobs['views_per_s'] / one['views_per_s']:.2f} | {one['peak_mb']} |"
         )

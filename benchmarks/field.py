@@ -1,8 +1,8 @@
 """Quality over training time: the grid and the twin (HumanNeRF) on the pinned studio actor.
 
 The grid as it is, under even light (nothing learns how light falls), and with a deferred head
-behind it that corrects pixels: ablations that share some of its budgets. All see the same pictures and
-are scored on the same true views from above in poses that no camera recorded. A training of the
+behind it that corrects pixels: ablations that share some of its budgets. All see the same pictures
+and are scored on the same true views from above in poses that no camera recorded. A training of the
 grid is as long as its schedule, so each budget is a training of its own; the twin has no schedule,
 so its budgets are stages of one training. Seconds are those of training alone, after compilation
 and decoding; the machine must be idle.
@@ -103,7 +103,8 @@ def parsed() -> argparse.Namespace:
         "rigs": 1,
     }  # fmt: skip
     quick = full | {
-        "budgets": (2.0,), "ablation_budgets": (2.0,), "twin_budgets": (5.0,), "views": ["e"], "actions": ["walk"],
+        "budgets": (2.0,), "ablation_budgets": (2.0,), "twin_budgets": (5.0,), "views": ["e"],
+        "actions": ["walk"],
     }  # fmt: skip
     options = parser.parse_args()
     for name, value in (quick if options.quick else full).items():

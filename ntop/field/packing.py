@@ -8,6 +8,7 @@ from ntop.field.kernels.packed import (
     NODES,
     PackedDensity,
     PackedSheets,
+    mark_straight,
     pack_bricks,
     pack_sheets,
 )
@@ -35,11 +36,14 @@ def packed_scene(
         poses: Of `warp`, that rays will ask for; else all. 12 MB each.
     """
     tables = grid.tables()
+    sheets = packed_sheets(tables, warp, poses)
+    # a straight cell is walked as a whole, from the face where a ray enters it
+    whole = np.where(sheets.straight & (warp.occupancy != 0), 255, warp.occupancy)
     return Scene(
         tables,
-        warp,
+        warp._replace(occupancy=whole.astype(np.uint8)),
         density or packed_density(grid),
-        packed_sheets(tables, warp, poses),
+        sheets,
         light,
         labels,
     )
@@ -77,4 +81,6 @@ def packed_sheets(
     rows[exists] = np.arange(len(sheets))
     corners = np.empty((len(sheets), 48), grid.values.dtype)
     pack_sheets(grid, warp, sheets, corners)
-    return PackedSheets(rows, corners)
+    straight = np.empty(len(rows), np.bool_)
+    mark_straight(rows, corners, straight)
+    return PackedSheets(rows, corners, straight)

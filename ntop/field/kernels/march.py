@@ -1,12 +1,13 @@
 """March rays through a posed avatar and composite: what every rendered pixel is made of.
 
-Inside an octant of the warp grid a ray is a straight line in canonical space, and between two faces
-of canonical voxels raw density is smooth along it. A ray is therefore cut into *pieces*, at the
-faces of octants and voxels, at the nodes t = (k + offset) * step of a lattice that bounds their
-lengths, and where one would take too much of the light that is left. No kink of the field lies
-inside a piece, so two Gauss points give its optical depth tau. With S the depth before it and T =
-exp(-S), its weight is w = T * (1 - exp(-tau)), and its colour that of the mean place at which it
-takes its light. Specification: `ntop.field.twin`, the same integral by brute force.
+Inside an octant of the warp grid, and inside a whole cell that bends nothing, a ray is a straight
+line in canonical space, and between two faces of canonical voxels raw density is smooth along it. A
+ray is therefore cut into *pieces*, at the faces of octants (or cells) and voxels, at the nodes t =
+(k + offset) * step of a lattice that bounds their lengths, and where one would take too much of the
+light that is left. No kink of the field lies inside a piece, so two Gauss points give its optical
+depth tau. With S the depth before it and T = exp(-S), its weight is w = T * (1 - exp(-tau)), and
+its colour that of the mean place at which it takes its light. Specification: `ntop.field.twin`, the
+same integral by brute force.
 
 Everything up to `march_ray` is scalar code over arrays and tuples without memory of its own, so
 that every compiler of numba can take it.
@@ -40,6 +41,7 @@ from ntop.field.kernels.pieces import (
 from ntop.field.kernels.tables import (
     DENSITY_SCALE,
     TINY_M,
+    leave_cell,
     next_octant,
     shade,
     start_ray,
@@ -62,17 +64,6 @@ def surface_normal(sheets, cell, sheet, fx, fy, fz):
     x, y, z = trilinear(sheets.corners, sheets.rows[cell, sheet], 24, fx, fy, fz)
     scale = 1 / math.sqrt(x * x + y * y + z * z + 1e-12)  # opposite normals may cancel
     return x * scale, y * scale, z * scale
-
-
-@device
-def lit_colour(sheets, light, cell, sheet, fx, fy, fz, albedo):
-    """A colour (3) under the light on the surface at a point of a cell."""
-    nx, ny, nz = surface_normal(sheets, cell, sheet, fx, fy, fz)
-    return (
-        albedo[0] * shade(light, 0, nx, ny, nz),
-        albedo[1] * shade(light, 1, nx, ny, nz),
-        albedo[2] * shade(light, 2, nx, ny, nz),
-    )
 
 
 @device
@@ -130,6 +121,8 @@ def march_ray(
             voxels += 1
             t = leave
             continue
+        if sheets.straight[cell]:
+            leave = leave_cell(ray, t, far, fx, fy, fz)
         length = leave - t
         two = sheets.rows[cell, 1] >= 0
         if cell == last_cell and t == last_t:
@@ -147,10 +140,6 @@ def march_ray(
         if two:
             end_b = sheet_place(sheets, cell, 1, gx, gy, gz)
             path_b = path_between(start_b, end_b, length)
-        # albedo times weight that waits for its light: normals vary slowly inside an octant
-        albedo = (0.0, 0.0, 0.0)
-        unlit = unlit_place = 0.0
-        unlit_sheet = 0
         s = 0.0
         while s < length and transmittance >= stop:
             # to the next face of a voxel
@@ -226,23 +215,13 @@ def march_ray(
                         ) / weight  # fmt: skip
                         sheet, x, y, z = denser_place(grid, density, path_a, path_b, two, q)
                         raw_red, raw_green, raw_blue = raw_colour(grid, x, y, z)
-                        if unlit > 0 and (sheet != unlit_sheet or colour_floor == 0):
-                            place = unlit_place / unlit
-                            lit = lit_colour(
-                                sheets, light, cell, unlit_sheet, fx + place * ray[3],
-                                fy + place * ray[4], fz + place * ray[5], albedo,
-                            )  # fmt: skip
-                            red, green, blue = red + lit[0], green + lit[1], blue + lit[2]
-                            albedo, unlit, unlit_place = (0.0, 0.0, 0.0), 0.0, 0.0
-                        weight += carried
-                        albedo = (
-                            albedo[0] + weight * logistic(raw_red),
-                            albedo[1] + weight * logistic(raw_green),
-                            albedo[2] + weight * logistic(raw_blue),
+                        nx, ny, nz = surface_normal(
+                            sheets, cell, sheet, fx + q * ray[3], fy + q * ray[4], fz + q * ray[5]
                         )
-                        unlit_sheet = sheet
-                        unlit += weight
-                        unlit_place += weight * q
+                        weight += carried
+                        red += weight * logistic(raw_red) * shade(light, 0, nx, ny, nz)
+                        green += weight * logistic(raw_green) * shade(light, 1, nx, ny, nz)
+                        blue += weight * logistic(raw_blue) * shade(light, 2, nx, ny, nz)
                         coloured += weight
                         carried = 0.0
                     else:
@@ -251,13 +230,6 @@ def march_ray(
                     transmittance *= (1 + lost_first) * (1 + lost_second)
                 s = end
             s = max(s, border)
-        if unlit > 0:
-            place = unlit_place / unlit
-            lit = lit_colour(
-                sheets, light, cell, unlit_sheet, fx + place * ray[3], fy + place * ray[4],
-                fz + place * ray[5], albedo,
-            )  # fmt: skip
-            red, green, blue = red + lit[0], green + lit[1], blue + lit[2]
         t = leave
     if coloured > 0:  # what is still carried takes the colour of what came before
         share = 1 + carried / coloured

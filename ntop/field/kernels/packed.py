@@ -6,6 +6,7 @@ and once per pose, each is one short run of numbers. Training changes values all
 reads the tables themselves.
 """
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -15,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from ntop.field.kernels import device, kernel
 from ntop.field.kernels.tables import EMPTY_RAW, VOID_RAW
 
+STRAIGHT_VOXELS = 0.02  # a tenth of a millimetre at most, and far less for most rays
 NODES = 5  # along a packed brick: its own four and the first of the next
 
 
@@ -34,11 +36,13 @@ class PackedSheets(NamedTuple):
     """Corners of the cells of `WarpTables` that may hold density.
 
     `rows[cell, sheet]` is the sheet's row, or -1. A row holds the canonical places of the 8 corners
-    (in voxels of the canonical grid), then their world normals, by corner number.
+    (in voxels of the canonical grid), then their world normals, by corner number. In a `straight`
+    cell a ray is a straight line in canonical space, to STRAIGHT_VOXELS.
     """
 
     rows: Int[np.ndarray, "cell 2"]
     corners: Float[np.ndarray, "sheet 48"]
+    straight: Bool[np.ndarray, " cell"]
 
 
 @device
@@ -171,3 +175,44 @@ def pack_sheets(grid, warp, sheets, corners):
                     grid.inverse_voxel
                 )
                 corners[n, 24 + 3 * corner + axis] = node[3 + axis]
+
+
+@device
+def twist(points, row, edge, other):
+    """Length of a face's second difference (voxels), the larger one of two opposite faces.
+
+    Faces are spanned by the corner numbers' bits `edge` and `other`.
+    """
+    largest = 0.0
+    for start in (0, 7 - edge - other):
+        squared = 0.0
+        for axis in range(3):
+            difference = (
+                points[row, 3 * start + axis]
+                - points[row, 3 * (start + edge) + axis]
+                - points[row, 3 * (start + other) + axis]
+                + points[row, 3 * (start + edge + other) + axis]
+            )
+            squared += difference * difference
+        largest = max(largest, squared)
+    return math.sqrt(largest)
+
+
+@kernel
+def mark_straight(rows, corners, straight):
+    """Which cells map every straight line through them to nearly a straight line.
+
+    Along a line through a unit cell the second derivative of a trilinear map is at most twice the
+    sum of its faces' second differences, and the line bends by an eighth of it.
+
+    Args:
+        rows, corners: see `PackedSheets`. straight: (cells,) output.
+    """
+    for cell in numba.prange(rows.shape[0]):
+        straight[cell] = rows[cell, 0] >= 0
+        for sheet in range(2):
+            row = rows[cell, sheet]
+            if row >= 0:
+                bend = twist(corners, row, 4, 2) + twist(corners, row, 4, 1)
+                bend += twist(corners, row, 2, 1)
+                straight[cell] = straight[cell] and 0.25 * bend <= STRAIGHT_VOXELS

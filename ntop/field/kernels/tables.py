@@ -254,6 +254,19 @@ def next_octant(warp, pose, ray, t, far, skipping):
 
 
 @device
+def leave_cell(ray, t, far, fx, fy, fz):
+    """Length at which a ray leaves the cell in which it is at place (fx, fy, fz) after `t`."""
+    low_x = math.floor(ray[0] + t * ray[3] - fx + 0.5)
+    low_y = math.floor(ray[1] + t * ray[4] - fy + 0.5)
+    low_z = math.floor(ray[2] + t * ray[5] - fz + 0.5)
+    leave = min(
+        exit_length(ray[0], ray[6], low_x, 1.0),
+        min(exit_length(ray[1], ray[7], low_y, 1.0), exit_length(ray[2], ray[8], low_z, 1.0)),
+    )
+    return min(max(leave, t + TINY_M), far)
+
+
+@device
 def next_sample(warp, pose, ray, far, step, offset, k):
     """The first sample >= k in an occupied octant, and where it is; cell -1 if there is none.
 

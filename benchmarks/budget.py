@@ -35,7 +35,7 @@ from benchmarks.fields import kept_field
 from benchmarks.pictures import Studio, open_studio, true_views
 from benchmarks.studio import chosen_rows
 from ntop.field.avatar import Avatar
-from ntop.field.rendering import pose_avatar
+from ntop.field.posing import pose_avatar
 from ntop.metrics.images import Cutout
 from ntop.storage.atomic import write_bytes
 from ntop.storage.bodies import body_pose_from_rows

@@ -19,7 +19,9 @@ from ntop.config.sections import TrainConfig
 from ntop.config.sources import StudioSource
 from ntop.field.avatar import Avatar
 from ntop.field.culling import body_pixels, pixel_window
-from ntop.field.rendering import PRESETS, PosedAvatar, render_view
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import PRESETS
+from ntop.field.rendering import render_view
 from ntop.field.schedule import TrainingSettings
 from ntop.field.training import train
 from ntop.geometry.cameras import Camera

@@ -22,7 +22,8 @@ from ntop.body.skinning import BodyPose
 from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.field.avatar import Avatar
 from ntop.field.kernels.adjoint import ROBUST_WIDTH
-from ntop.field.rendering import PosedAvatar, Rendering, pose_avatar, render_view
+from ntop.field.posing import PosedAvatar, pose_avatar
+from ntop.field.rendering import Rendering, render_view
 from ntop.field.views import MATTE_INSIDE, TrainingViews
 from ntop.geometry.cameras import Camera
 from ntop.geometry.rotations import matrix_from_axis_angle

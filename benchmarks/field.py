@@ -99,12 +99,12 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=ROOT / "benchmarks/work/field")
     full = {
         "budgets": BUDGETS_S, "ablation_budgets": ABLATION_BUDGETS_S,
-        "twin_budgets": TWIN_BUDGETS_S, "views": ["centre", "e"], "actions": [], "sets": 1,
-        "rigs": 1,
+        "twin_budgets": TWIN_BUDGETS_S, "views": ["centre", "e", "nw"], "actions": [], "sets": 1,
+        "rigs": 2,
     }  # fmt: skip
     quick = full | {
         "budgets": (2.0,), "ablation_budgets": (2.0,), "twin_budgets": (5.0,), "views": ["e"],
-        "actions": ["walk"],
+        "actions": ["walk"], "rigs": 1,
     }  # fmt: skip
     options = parser.parse_args()
     for name, value in (quick if options.quick else full).items():

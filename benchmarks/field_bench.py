@@ -12,7 +12,8 @@ from benchmarks.studio import Scores, Show, score
 from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose
 from ntop.field.interface import AnyAvatar, load_avatar, pose_avatar, render_view, save_avatar
-from ntop.field.rendering import PosedAvatar, Rendering
+from ntop.field.posing import PosedAvatar
+from ntop.field.rendering import Rendering
 from ntop.field.views import TrainingViews
 from ntop.geometry.cameras import Camera
 from ntop.metrics.lpips import Lpips

@@ -14,7 +14,7 @@ from ntop.field.kernels.tables import (
     interpolate,
     surface_normal,
 )
-from ntop.field.rendering import PosedAvatar
+from ntop.field.posing import PosedAvatar
 
 
 def first_surfaces(

@@ -42,12 +42,9 @@ from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
 from ntop.field.devices import VISIBLE_VARIABLE, kernel_device
 from ntop.field.marching import MarchRule, Rays, Scene, march_on_cpu, march_rays
-from ntop.field.rendering import (
-    PosedAvatar,
-    RenderSettings,
-    pose_avatar,
-    render_view,
-)
+from ntop.field.posing import PosedAvatar, pose_avatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view
 from ntop.field.training import train
 from ntop.geometry.cameras import Camera
 from ntop.stages.s4_train import training_settings

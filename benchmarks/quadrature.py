@@ -29,7 +29,8 @@ from benchmarks.quadrature_errors import (
 from benchmarks.quadrature_plot import knee, plot
 from benchmarks.subjects import RIGS, Subject, chosen_results, subjects
 from ntop.conventions import VIEWS
-from ntop.field.rendering import PRESETS, RenderSettings, render_view
+from ntop.field.quality import PRESETS, RenderSettings
+from ntop.field.rendering import render_view
 from ntop.geometry.windows import resized
 
 ROUNDS = 7

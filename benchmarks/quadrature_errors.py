@@ -19,7 +19,9 @@ from ntop.annotation.visibility import NEIGHBOURS, OUTSIDE, SMPL24_LIMBS, keypoi
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
 from ntop.field.paper_sampler import paper_steps, trace_paper_rays
-from ntop.field.rendering import PosedAvatar, RayRendering, RenderSettings, trace_rays
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import RayRendering, trace_rays
 from ntop.geometry.cameras import Camera
 from ntop.metrics.stripes import MAX_AMPLITUDE, MAX_Z, lock_in
 

@@ -34,7 +34,8 @@ from benchmarks.studio import Scores, chosen_rows, score
 from ntop.captures.studio.recording import disturbed, grown, misplaced
 from ntop.config.sections import TrainConfig
 from ntop.field.avatar import Avatar
-from ntop.field.rendering import pose_avatar, render_view
+from ntop.field.posing import pose_avatar
+from ntop.field.rendering import render_view
 from ntop.field.training import train
 from ntop.field.views import TrainingViews
 from ntop.stages.s4_train import training_settings

@@ -19,7 +19,9 @@ from benchmarks.subjects import RIGS, Subject, chosen_results, subjects
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
 from ntop.field.paper_sampler import SAMPLES, box_interval
-from ntop.field.rendering import PosedAvatar, RenderSettings, render_view, trace_rays
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import resized
 

@@ -25,7 +25,8 @@ from ntop.field.canonical import (
     number_bricks,
     void_values,
 )
-from ntop.field.rendering import PosedAvatar, RenderSettings, pose_avatar
+from ntop.field.posing import PosedAvatar, pose_avatar
+from ntop.field.quality import RenderSettings
 from ntop.geometry.cameras import Camera
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.storage import schemas

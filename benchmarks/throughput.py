@@ -33,7 +33,8 @@ from ntop.config.sections import AnnotateConfig, ImageConfig, RenderConfig, RigC
 from ntop.conventions import VIEWS
 from ntop.field.culling import body_pixels
 from ntop.field.interface import pose_avatar, render_view
-from ntop.field.rendering import PRESETS, Rendering
+from ntop.field.quality import PRESETS
+from ntop.field.rendering import Rendering
 from ntop.geometry.cameras import Camera
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle

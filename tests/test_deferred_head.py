@@ -18,7 +18,8 @@ from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import NUM_BETAS
 from ntop.field.avatar import Avatar
 from ntop.field.canonical import canonical_body
-from ntop.field.rendering import PosedAvatar, pose_avatar, render_view
+from ntop.field.posing import PosedAvatar, pose_avatar
+from ntop.field.rendering import render_view
 from ntop.field.schedule import TrainingSettings
 from ntop.field.trainer import initial_state
 from ntop.geometry.cameras import Camera

@@ -11,14 +11,16 @@ from ntop.body.model import BodyModel
 from ntop.body.skinning import BodyPose
 from ntop.conventions import DataError
 from ntop.field import avatar as grid
-from ntop.field import rendering as grid_rendering
+from ntop.field import posing, rendering
 from ntop.field.avatar import Avatar, read_avatar_files
 from ntop.field.devices import kernel_words
 from ntop.field.humannerf import avatar as humannerf
 from ntop.field.humannerf.avatar import HumanNerfAvatar
 from ntop.field.humannerf.device import device_words
 from ntop.field.humannerf.rendering import PosedHumanNerf, pose_humannerf, render_humannerf
-from ntop.field.rendering import PosedAvatar, Rendering, RenderSettings
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import Rendering
 from ntop.geometry.cameras import Camera
 
 AnyAvatar = Avatar | HumanNerfAvatar
@@ -79,7 +81,7 @@ def pose_avatar(
     """
     match avatar:
         case Avatar():
-            return grid_rendering.pose_avatar(avatar, model, pose, settings=settings)
+            return posing.pose_avatar(avatar, model, pose, settings=settings)
         case HumanNerfAvatar():
             return pose_humannerf(avatar, model, pose)
         case _:
@@ -95,7 +97,7 @@ def render_view(
     """
     match posed:
         case PosedAvatar():
-            return grid_rendering.render_view(posed, camera, settings=settings)
+            return rendering.render_view(posed, camera, settings=settings)
         case PosedHumanNerf():
             return render_humannerf(posed, camera)
         case _:

@@ -17,7 +17,7 @@ from torch import Tensor
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
 from ntop.field.kernels import paper
-from ntop.field.rendering import PosedAvatar
+from ntop.field.posing import PosedAvatar
 from ntop.geometry.cameras import Camera
 
 SAMPLES = 128

@@ -3,110 +3,21 @@
 Only pixels that the projection of an occupied cell touches are marched; edges get several rays.
 """
 
-import functools
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from ntop.body.model import BodyModel
-from ntop.body.skinning import BodyPose
-from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE, ConfigError, DataError
-from ntop.field.avatar import Avatar
-from ntop.field.canonical import (
-    CanonicalGrid,
-    Occupancy,
-    PartLabels,
-    canonical_body,
-    dense_voxels,
-    label_grid,
-)
+from ntop.conventions import MASK_ALPHA, PIXEL_CENTRE, DataError
 from ntop.field.culling import body_sight, pixel_window
 from ntop.field.edges import CONTRAST_OFFSETS_PX, OUTLINE_OFFSETS_PX, edge_pixels, middle_ray
-from ntop.field.kernels.packed import PackedDensity
-from ntop.field.kernels.tables import EMPTY_RAW
-from ntop.field.marching import EVERYWHERE, MarchRule, Rays, Scene, march_rays
-from ntop.field.packing import packed_density, packed_scene
+from ntop.field.marching import EVERYWHERE, Rays, march_rays
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
 from ntop.field.straight import straight_colours
-from ntop.field.warp import PoseWarp, occupied, pose_warp, with_octants
 from ntop.geometry.cameras import Camera
-
-CELL_M = 0.012  # of the warp grid; a coarser one bends wrongly at joints (0.02: -0.6 dB)
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How exactly to march; every shortcut can be switched off, and costs at most its bound.
-
-    Args:
-        step_m: Largest length of a piece of a ray; faces of voxels cut it as well.
-        piece_depth: Largest optical depth of a piece, by its denser end (infinity: any); the less
-            light is left on the ray, the deeper it may be.
-        stop_transmittance: Light left at which a ray ends (0: never); bounds the colour's error.
-        colour_floor: Light up to which pieces of a ray share one colour (0: each has its own).
-        intervals: Jump over space that no warp cell covers.
-        cells: Jump over octants of cells in which the field is empty.
-        extent: How much of an octant is asked whether it is empty; less than 1 may miss density.
-        crop: March only pixels that may see the body.
-        edge_rays: 4: so many rays more on outlines, half as many on contrasts; 1: one ray through
-            every pixel's centre.
-        phase: Offset of all pieces, in steps, for the phase-shift self-test.
-    """
-
-    step_m: float = 0.003
-    piece_depth: float = 1.0
-    stop_transmittance: float = 1e-3
-    colour_floor: float = 1e-3
-    intervals: bool = True
-    cells: bool = True
-    extent: float = 1.0
-    crop: bool = True
-    edge_rays: int = 4
-    phase: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse steps that never reach the end of a ray, and lights that cannot be left.
-
-        Raises:
-            ConfigError: a number is out of its range.
-        """
-        if not 0 < self.step_m < math.inf:
-            raise ConfigError(f"render step_m is {self.step_m} m, expected a positive length")
-        if not self.piece_depth > 0:
-            raise ConfigError(f"render piece_depth is {self.piece_depth}, expected more than 0")
-        for name in ("stop_transmittance", "colour_floor", "phase"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"render {name} is {getattr(self, name)}, expected 0 <= it < 1")
-        if not 0 <= self.extent <= 1:
-            raise ConfigError(f"render extent is {self.extent}, expected 0 <= it <= 1")
-        if self.edge_rays not in (1, 4):
-            raise ConfigError(f"render edge_rays is {self.edge_rays}, expected 1 or 4")
-
-    @property
-    def rule(self) -> MarchRule:
-        """What of this a march asks for."""
-        return MarchRule(
-            step_m=self.step_m,
-            piece_depth=self.piece_depth,
-            stop=self.stop_transmittance,
-            colour_floor=self.colour_floor,
-            skipping=self.intervals,
-        )
-
-
-# chosen and measured by `make bench`: benchmarks/quadrature.py, docs/benchmarks.md
-PRESETS = {
-    "draft": RenderSettings(
-        step_m=0.008, piece_depth=4.0, stop_transmittance=1e-2, colour_floor=2e-2, edge_rays=1
-    ),
-    "default": RenderSettings(),
-    "reference": RenderSettings(
-        step_m=0.0005, piece_depth=0.25, stop_transmittance=1e-5, colour_floor=0.0
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -148,79 +59,6 @@ class RayRendering:
     def evaluations(self) -> int:
         """What it cost: voxels looked up and densities computed."""
         return self.voxels + self.samples
-
-
-@dataclass(frozen=True)
-class PosedAvatar:
-    """All that the views of one pose share; `density` is `grid`'s, packed, where it is known."""
-
-    grid: CanonicalGrid
-    warp: PoseWarp
-    light: Float[np.ndarray, "9 3"]
-    labels: PartLabels
-    density: PackedDensity | None = None
-
-    @functools.cached_property
-    def scene(self) -> Scene:
-        """What rays march through, packed once for all views."""
-        return packed_scene(
-            self.grid, self.warp.tables, self.light, self.labels, density=self.density
-        )
-
-
-def pose_avatar(
-    avatar: Avatar,
-    model: BodyModel,
-    pose: BodyPose,
-    *,
-    settings: RenderSettings | None = None,
-    cell_m: float = CELL_M,
-) -> PosedAvatar:
-    """The per-pose work, once for all views: warp grid and occupancy of a single pose."""
-    settings = settings or RenderSettings()
-    body = canonical_body(model, avatar.betas)
-    warp = pose_warp(body, model, pose, cell_m=cell_m, reach_m=avatar.reach_m)
-    shared = _shared(avatar, model)
-    if settings.cells:
-        tables = occupied(warp.tables, shared.dense, extent=settings.extent)
-    else:
-        tables = with_octants(warp.tables, np.full_like(warp.tables.occupancy, 255))
-    return PosedAvatar(
-        grid=avatar.grid,
-        warp=replace(warp, tables=tables),
-        light=avatar.light.astype(np.float32),
-        labels=shared.labels,
-        density=shared.density,
-    )
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """What is the same in every pose of an avatar; it holds what its key names."""
-
-    avatar: Avatar
-    model: BodyModel
-    dense: Occupancy
-    density: PackedDensity
-    labels: PartLabels
-
-
-_SHARED: dict[tuple[int, int], _Shared] = {}
-
-
-def _shared(avatar: Avatar, model: BodyModel) -> _Shared:
-    """Made for an avatar's first pose, and kept for the last avatar."""
-    key = (id(avatar), id(model))
-    if key not in _SHARED:
-        _SHARED.clear()
-        _SHARED[key] = _Shared(
-            avatar,
-            model,
-            dense_voxels(avatar.grid, raw_threshold=EMPTY_RAW),
-            packed_density(avatar.grid),
-            label_grid(canonical_body(model, avatar.betas)),
-        )
-    return _SHARED[key]
 
 
 def trace_rays(

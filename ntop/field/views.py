@@ -6,6 +6,7 @@ photographs fit in memory.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -138,14 +139,8 @@ def spread(count: int, generator: np.random.Generator) -> Float[np.ndarray, " ra
 
 def _zones(matte: UInt8[np.ndarray, "height width"], band_px: int) -> UInt8[np.ndarray, "h w"]:
     """1 well inside the person, 2 within `band_px` of the edge, 0 outside."""
-    soft = torch.from_numpy(matte.astype(np.float32))[None, None]
-    size = 2 * band_px + 1
-
-    def grown(values: torch.Tensor) -> np.ndarray:
-        pooled = torch.nn.functional.max_pool2d(values, size, stride=1, padding=band_px)
-        return pooled[0, 0].numpy()
-
-    highest, lowest = grown(soft), -grown(-soft)
+    around = np.ones((2 * band_px + 1, 2 * band_px + 1), np.uint8)
+    highest, lowest = cv2.dilate(matte, around), cv2.erode(matte, around)
     inside = lowest >= MATTE_INSIDE
     band = (highest > MATTE_OUTSIDE) & ~inside
     return np.where(inside, 1, np.where(band, 2, 0)).astype(np.uint8)

@@ -13,7 +13,9 @@ from jaxtyping import Float
 
 from ntop.field.canonical import CanonicalGrid, PartLabels, dense_voxels, number_bricks
 from ntop.field.kernels.tables import EMPTY_RAW, VOID_RAW
-from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view
 from ntop.field.warp import identity_warp, occupied
 from ntop.geometry.cameras import Camera
 from ntop.geometry.windows import cropped, resized

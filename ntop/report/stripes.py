@@ -17,13 +17,9 @@ from ntop.body.model import BodyModel
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.avatar import FIELD, load_avatar, read_avatar_files
 from ntop.field.paper_sampler import SAMPLES, render_paper_view
-from ntop.field.rendering import (
-    PosedAvatar,
-    RenderSettings,
-    pose_avatar,
-    render_view,
-    trace_rays,
-)
+from ntop.field.posing import PosedAvatar, pose_avatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.geometry.cameras import Camera, Pinhole
 from ntop.metrics.stripes import (
     MAX_AMPLITUDE,

@@ -25,7 +25,8 @@ from ntop.config.sections import RenderConfig
 from ntop.conventions import VIEWS, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME
 from ntop.field.interface import AnyAvatar, compute_words, load_avatar, pose_avatar, render_view
-from ntop.field.rendering import PRESETS, Rendering
+from ntop.field.quality import PRESETS
+from ntop.field.rendering import Rendering
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.stages import VERSIONS
 from ntop.storage import schemas

@@ -14,7 +14,8 @@ from ntop.body.model import BodyModel, load_body_model
 from ntop.conventions import PIXEL_CENTRE, ConfigError, DataError
 from ntop.field.avatar import ARRAYS_NAME, Avatar, load_avatar
 from ntop.field.paper_sampler import paper_steps
-from ntop.field.rendering import RenderSettings, pose_avatar
+from ntop.field.posing import pose_avatar
+from ntop.field.quality import RenderSettings
 from ntop.metrics.stripes import (
     MAX_AMPLITUDE,
     MAX_PHASE_SHIFT,

@@ -21,7 +21,9 @@ from ntop.field.kernels.tables import TINY_M
 from ntop.field.learners import CpuLearner, StepRule
 from ntop.field.marching import MarchRule, Rays, march_on_cpu
 from ntop.field.packing import packed_scene
-from ntop.field.rendering import PosedAvatar, RenderSettings, render_view
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view
 from ntop.field.views import RayBatch
 from ntop.field.warp import identity_warp, joined
 from ntop.geometry.cameras import Camera

@@ -15,14 +15,9 @@ from ntop.body.skinning import BodyPose, pose_body
 from ntop.captures.studio.raycast import RayMesh
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.canonical import canonical_body
-from ntop.field.rendering import (
-    CELL_M,
-    PosedAvatar,
-    Rendering,
-    RenderSettings,
-    pose_avatar,
-    render_view,
-)
+from ntop.field.posing import CELL_M, PosedAvatar, pose_avatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import Rendering, render_view
 from ntop.field.warp import pose_warp
 from ntop.geometry.cameras import Camera
 from ntop.geometry.rigs import Rig, top_view_cameras

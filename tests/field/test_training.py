@@ -12,8 +12,10 @@ from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_body
 from ntop.conventions import PIXEL_CENTRE, DataError
 from ntop.field.avatar import ARRAYS_NAME, load_avatar, save_avatar
+from ntop.field.posing import pose_avatar
 from ntop.field.progress import TrainingStoppedError
-from ntop.field.rendering import RenderSettings, pose_avatar, render_view
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view
 from ntop.field.schedule import TrainingSettings
 from ntop.field.training import train
 from ntop.field.views import TrainingViews

@@ -15,7 +15,7 @@ from ntop.field.canonical import (
     number_bricks,
     void_values,
 )
-from ntop.field.rendering import PosedAvatar, pose_avatar
+from ntop.field.posing import PosedAvatar, pose_avatar
 
 VOXEL_M = 0.012
 SHELL_M = 0.036  # inside and outside of the surface

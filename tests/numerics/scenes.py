@@ -8,7 +8,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from ntop.field.canonical import CanonicalGrid, PartLabels, number_bricks, void_values
 from ntop.field.kernels.tables import DENSITY_SCALE, EMPTY_DENSITY
-from ntop.field.rendering import PosedAvatar, RenderSettings
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
 from ntop.field.twin import Composite, composite
 from ntop.field.warp import PoseWarp, identity_warp
 

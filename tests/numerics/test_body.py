@@ -17,7 +17,7 @@ from ntop.body.skeletons import SMPL24_NAMES
 from ntop.body.skinning import BodyPose, pose_body, pose_joints
 from ntop.field.canonical import canonical_body
 from ntop.field.kernels.posing import MIN_SCALE, vertex_maps, way_back
-from ntop.field.rendering import CELL_M
+from ntop.field.posing import CELL_M
 from ntop.field.warp import pose_warp
 from ntop.geometry.rotations import (
     axis_angle_from_matrix,

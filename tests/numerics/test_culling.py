@@ -13,7 +13,8 @@ from benchmarks.skipping import paper
 from benchmarks.subjects import painted
 from ntop.conventions import PIXEL_CENTRE
 from ntop.field.culling import body_pixels
-from ntop.field.rendering import PRESETS, RenderSettings, render_view, trace_rays
+from ntop.field.quality import PRESETS, RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.geometry.windows import resized
 
 SIDE = 160

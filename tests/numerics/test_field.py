@@ -13,7 +13,8 @@ from ntop.field import twin
 from ntop.field.canonical import Occupancy, refined_grid
 from ntop.field.culling import body_pixels
 from ntop.field.kernels.tables import VOID_RAW
-from ntop.field.rendering import RenderSettings, render_view, trace_rays
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.geometry.cameras import Camera, Equidistant, Pinhole, pixel_grid
 from ntop.geometry.rigs import ROTATION_LOOKING_DOWN, Rig, top_view_cameras
 from tests.numerics.avatars import analytic_avatar, posed_at, standing

@@ -31,7 +31,9 @@ from ntop.field.canonical import (
     label_grid,
 )
 from ntop.field.kernels.tables import EMPTY_RAW
-from ntop.field.rendering import PosedAvatar, Rendering, RenderSettings, render_view
+from ntop.field.posing import PosedAvatar
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import Rendering, render_view
 from ntop.field.warp import MAX_NODES, occupied, pose_warp
 from ntop.geometry.cameras import Camera, Lens
 from ntop.geometry.ideal_fisheyes import Equidistant, Equisolid, Stereographic

@@ -13,7 +13,8 @@ import torch
 from ntop.body.model import load_body_model
 from ntop.body.skinning import pose_body
 from ntop.field.paper_sampler import BOX_MARGIN_M, SAMPLES, box_interval, trace_paper_rays
-from ntop.field.rendering import RenderSettings, trace_rays
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import trace_rays
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.metrics.stripes import lock_in
 from ntop.report.stripes import pinhole_at, sampled_views

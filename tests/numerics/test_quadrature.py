@@ -9,7 +9,8 @@ import torch
 from ntop.conventions import ConfigError, DataError
 from ntop.field import rendering, twin
 from ntop.field.kernels.tables import VOID_RAW
-from ntop.field.rendering import RenderSettings, trace_rays
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import trace_rays
 from tests.numerics.scenes import DEFAULT_STEP_M, composed, cone, exact, posed_field, raw_of
 
 

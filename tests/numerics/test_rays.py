@@ -13,7 +13,8 @@ from ntop.body.model import load_body_model
 from ntop.body.skinning import BodyPose, pose_joints
 from ntop.conventions import VIEWS
 from ntop.field.kernels.tables import next_sample, start_ray
-from ntop.field.rendering import RenderSettings, render_view, trace_rays
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.field.warp import identity_warp
 from ntop.geometry.cameras import Camera
 from ntop.geometry.fisheyes import fisheye_lens

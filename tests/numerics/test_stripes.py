@@ -11,7 +11,8 @@ import pytest
 
 from ntop.body.model import load_body_model
 from ntop.body.skinning import pose_body
-from ntop.field.rendering import RenderSettings, render_view, trace_rays
+from ntop.field.quality import RenderSettings
+from ntop.field.rendering import render_view, trace_rays
 from ntop.geometry.rigs import Rig, top_view_cameras
 from ntop.metrics.stripes import (
     MAX_AMPLITUDE,

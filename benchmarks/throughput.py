@@ -55,7 +55,7 @@ class Case:
     work: str = "labels"
     threads: int = 1
     size_px: int = 1000
-    height_m: float = 1.4  # the demo's studio actor is 200 pixels large on average
+    height_m: float = 1.5  # the studio actor of the demo is 200 pixels large on average
     quality: str = "default"
     views: int = len(VIEWS)
     sets: int = 3
@@ -98,7 +98,7 @@ def main(results: Path | None) -> None:
             ]
             for axis, values in {
                 "size_px": (250, 500, 1000, 2000),
-                "height_m": (1.0, 1.4, 2.0, 2.8),
+                "height_m": (1.0, 1.5, 2.0, 3.0),
                 "views": (1, 3, 9),
                 "sets": (1, 3, 9),
             }.items()

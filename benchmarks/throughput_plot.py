@@ -26,7 +26,7 @@ def plot(values: dict) -> None:
         axis.set_xscale("log", base=2)
         axis.set_xticks([row[name] for row in rows], [f"{row[name]:g}" for row in rows])
         axis.set_xlabel(label)
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.1 * max(row["cpu_ms_per_view"] for row in rows))
     axes[0].set_ylabel("ms of a core per view")
     for quality, mark in (("default", "o-"), ("draft", "o--")):
         rows = [

@@ -42,7 +42,7 @@ def field_lines(values: dict[str, Any]) -> list[str]:
         f"`python -m benchmarks.field`: the studio's actor `plain`, {values['pictures']} pictures, "
         f"{values['scored_views']} true views from above in novel poses. Seconds are those of "
         "training alone, after compilation and decoding. "
-        f"The twin ran on: {values['device']}. {where(values)}",
+        f"{where(values)}",
         "",
         "* **grid + light**: the default; light that depends on the surface's direction in the "
         "world is learned with the colours.",
@@ -50,7 +50,8 @@ def field_lines(values: dict[str, Any]) -> list[str]:
         "* **grid + light + head**: a shorter training of the default, then a deferred head in the "
         "rest of the budget: a tiny network that corrects every pixel of a finished picture "
         "([decision 0022](decisions/0022-no-deferred-head.md)).",
-        "* **HumanNeRF twin**: the paper's method; hollow marks in the plot are unconverged.",
+        f"* **HumanNeRF twin**: the paper's method, on: {values['device']}; hollow marks in the plot "
+        "are unconverged.",
         "",
         "![Quality over training time](../benchmarks/results/field.png)",
         "",
@@ -68,6 +69,8 @@ def field_lines(values: dict[str, Any]) -> list[str]:
             f"{scores['mask_iou']:.4f} | {'' if depth_mm is None else f'{depth_mm:.1f}'} | "
             f"{point['render_s_per_view']:.2f} |"
         )
+    if not any(point["field"] == "humannerf" for point in values["points"]):
+        return [*lines, "", "The twin was not trained in this run."]
     wins = values["twin_wins"]
     won = ", ".join(sorted({win["metric"] for win in wins})) or "none"
     return [

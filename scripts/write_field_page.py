@@ -50,8 +50,8 @@ def field_lines(values: dict[str, Any]) -> list[str]:
         "* **grid + light + head**: a shorter training of the default, then a deferred head in the "
         "rest of the budget: a tiny network that corrects every pixel of a finished picture "
         "([decision 0022](decisions/0022-no-deferred-head.md)).",
-        f"* **HumanNeRF twin**: the paper's method, on: {values['device']}; hollow marks in the plot "
-        "are unconverged.",
+        f"* **HumanNeRF twin**: the paper's method, on: {values['device']}; hollow marks in the "
+        "plot are unconverged.",
         "",
         "![Quality over training time](../benchmarks/results/field.png)",
         "",

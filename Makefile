@@ -76,7 +76,6 @@ bench-field: env
 	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.poses
 	$(RUN) NUMBA_NUM_THREADS=$(CORES) python -m benchmarks.heldout
 	$(RUN) python scripts/write_field_page.py
-	$(RUN) python scripts/write_poses_page.py
 
 # training and rendering on an NVIDIA GPU, a few minutes; PARTS="launches views" for some parts only
 bench-gpu: env

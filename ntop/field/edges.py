@@ -1,7 +1,7 @@
 """Pixels that one ray does not do justice, and the rays that they get besides it.
 
-Compared with 64 rays in every pixel, an outline needs four more and a contrast inside the body two:
-as many for the second as for the first changes the colours by a tenth of what is missed anyway.
+Outlines get four, contrasts inside the body two: with four there as well, colours are off by 2.18
+instead of 2.40 grey levels (rms against 36 rays in every pixel; decision 0024).
 """
 
 import numpy as np

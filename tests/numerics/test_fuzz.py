@@ -138,6 +138,15 @@ def vectors(size: int, bound: float) -> st.SearchStrategy:
 POSES = st.builds(BodyPose, vectors(10, 2.0), vectors(3, 3.0), vectors(69, 1.0), vectors(3, 2.0))
 
 
+def turned_to(rotation: torch.Tensor, way: torch.Tensor) -> torch.Tensor:
+    """A camera's rotation, turned by the smallest angle that makes it look along a world vector."""
+    axis, way = rotation[2], way / way.norm()
+    across = torch.linalg.cross(axis, way)
+    angle = torch.atan2(across.norm(), axis @ way)
+    turn = matrix_from_axis_angle(angle * across / across.norm())
+    return rotation @ turn.T
+
+
 def check_view(rendering: Rendering, camera: Camera, columns: dict) -> None:
     """Finite pixels in range, files that decode, labels that are numbers."""
     shape = (camera.lens.height, camera.lens.width)
@@ -177,16 +186,24 @@ OUTCOMES: Counter[str] = Counter()
     make_lens=lenses(),
     center=vectors(3, 1.5),
     turn=vectors(3, 2.0),
+    aimed=st.booleans(),
     pose=POSES,
     kind=st.sampled_from(FIELDS),
     step_m=mostly(st.sampled_from([0.01, 0.05, 0.3]), ANY),
     edge_rays=st.sampled_from([1, 4]),
 )
-def finite_or_refused(make_lens, center, turn, pose, kind, step_m, edge_rays):
-    """One example; bad input may only end in an error that says what it is."""
+def finite_or_refused(make_lens, center, turn, aimed, pose, kind, step_m, edge_rays):
+    """One example; bad input may only end in an error that says what it is.
+
+    Half of the cameras look at the body: of those that look anywhere, few see it, and how many
+    depends on which constants hypothesis finds in the modules that are loaded.
+    """
     try:
         lens = make_lens()
-        camera = Camera(lens, center, matrix_from_axis_angle(turn))
+        rotation = matrix_from_axis_angle(turn)
+        if aimed:
+            rotation = turned_to(rotation, pose.transl - center)
+        camera = Camera(lens, center, rotation)
         columns = body_columns(load_model(), pose)
         avatar = posed(kind, pose)
         settings_ = RenderSettings(step_m=step_m, edge_rays=edge_rays)
@@ -215,8 +232,7 @@ def test_42_five_hundred_random_views_are_finite_or_refused(margin):
     grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     margin.at_most("memory", grown_mb, MEMORY_LIMIT_MB, "MB")
     margin.at_least("examples", sum(OUTCOMES.values()), 500)
-    # the examples follow the code, not only the seed: 44 to 65 of them were seen
-    margin.at_least("views that show somebody", OUTCOMES["seen"], 30)
+    margin.at_least("views that show somebody", OUTCOMES["seen"], 50)
     margin.at_least("refused", OUTCOMES["refused"], 20)
 
 
